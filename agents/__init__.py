@@ -1,6 +1,6 @@
-"""Agents for the environments of `lag_envs`: learners, the optimum, and what all agents reach."""
+"""Agents for the environments of `lag_envs`: learners, the optimum, and the results of all agents."""
 
 import time
 
-#: When the command began, but for the interpreter's own start [s]; libraries are imported later.
+#: When the command began, after the interpreter's own start [s]; libraries are imported later.
 STARTED = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Statistics of what was measured of agents; their outcome is all that figures and page need."""
+"""Statistics of the agents' measurements; figures and page need nothing else."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Data = dict[str, Any]
 
 #: Points of a learning curve.
 POINTS = 33
-#: Scores that are waited for.
+#: Scores whose first arrival is reported.
 LEVELS = (0.9, 0.97, 0.99)
 
 
@@ -31,15 +31,15 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
     Parameters
     ----------
     curves : sequence, each of shape (n, 3)
-        Steps, seconds and result for each seed; read between the points as if straight.
+        Steps, seconds and result for each seed; interpolated linearly between the points.
     column : int
-        What the curves run over: 0 steps, 1 seconds.
+        The abscissa: 0 steps, 1 seconds.
 
     Returns
     -------
     dict or None
         ``x``, ``value``, ``low`` and ``high``, over the part that all curves have in common; without an
-        interval for a single seed. None where there is no such part.
+        interval for a single seed. None if there is no such part.
     """
     tables = [np.array(c, np.float64).reshape(-1, 3) for c in curves]
     if not tables or any(len(t) < 2 for t in tables):
@@ -59,7 +59,7 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
 def reached(curve: Iterable[Sequence[float]], level: float, clock: int = 1) -> float | None:
     """Return when a curve first reached a level; None for never.
 
-    Points end with the score; `clock` is the place of what is told: 0 steps, 1 seconds.
+    The last number of each point is its score; `clock` selects the result: 0 steps, 1 seconds.
     """
     return next((point[clock] for point in curve if point[-1] >= level), None)
 
@@ -84,7 +84,7 @@ def times(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
 
 
 def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
-    """Return all that figures and page need of one environment.
+    """Return everything that figures and page need for one environment.
 
     Parameters
     ----------
@@ -126,10 +126,10 @@ def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
 
 
 def level(conditions: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array]]:
-    """Return returns of conditions that were measured in fewer episodes, comparable with those in all.
+    """Make returns from fewer episodes comparable with those from all episodes.
 
-    Some episodes are easier than others. So the returns are moved by as much as the same policy's return in
-    the same episodes differs from its return in all of them, both without the condition.
+    Some episodes are easier than others. So the returns are corrected by the difference between the same
+    policy's return in these episodes and in all of them, both without the condition.
     """
     nominal = [np.asarray(g, np.float64) for g in conditions[NOMINAL]]
     found = {}
@@ -155,7 +155,7 @@ def compare(agents: Mapping[str, Data]) -> Data:
             x, y = each[one], each[other]
             if len(y) > 1:
                 ends = interval(improvement, x, y)
-            else:  # against one policy only the runs can be drawn anew
+            else:  # against a single policy, only the runs can be resampled
                 ends = interval(partial(improvement, y=y), x)
             found.setdefault(one, {})[other] = {"value": float(improvement(x, y)), "interval": ends}
     return found

@@ -1,8 +1,8 @@
-"""How agents act: when they get there, how far off they end, how fast they cross a line.
+"""How agents act: arrival times, final errors, speeds at a line.
 
-``python -m agents.behaviour`` plays the episodes that `docs/agents.md` is about, with the quick controllers
-and with our learned policies that are verified on the board. It writes ``agents/results/behaviour.json``, and
-``python -m agents.results --redraw`` makes that page's tables of it.
+``python -m agents.behaviour`` plays the episodes of `docs/agents.md`, with the quick controllers and with our
+learned policies that are verified on the board. It writes ``agents/results/behaviour.json``, from which
+``python -m agents.results --redraw`` makes that page's tables.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ EPISODES = 1_000
 
 
 def arrival(what: str, played: Episodes) -> dict[str, float | None]:
-    """Measure when the board's goal is reached for good, and what is lost by then and afterwards.
+    """Measure when the board's goal is reached for good, and the reward lost before and after that.
 
-    Lost is what a step's reward lacks to 1. Means are over the episodes in which the goal holds at the end,
-    None where it never does; the others are counted.
+    The loss of a step is 1 minus its reward. Means are over the episodes in which the goal holds at the end,
+    None if it never does; the others are counted.
     """
     seconds = played.settled()
     well = np.isfinite(seconds)
@@ -54,7 +54,7 @@ def arrival(what: str, played: Episodes) -> dict[str, float | None]:
 
 
 def measures(played: Episodes) -> dict[str, float | None]:
-    """Return what is told of episodes: the arrival at the goal, and what the task itself adds."""
+    """Return the measures of episodes: the arrival at the goal, and the task's own measures."""
     task = played.task
     found = arrival(task.goal.arrival, played) if task.goal and task.goal.arrival else {}
     return found | dict(task.behaviour(played))
@@ -64,8 +64,8 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
     """Yield our quick agents of an environment: name, and policies, one for each training seed."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
-        agent = None if found.plans else build(task, name)  # to plan takes long
-        if agent is not None and not isinstance(agent, Constant):  # which shows nothing
+        agent = None if found.plans else build(task, name)  # planning takes long
+        if agent is not None and not isinstance(agent, Constant):  # a constant action shows nothing
             yield name, [agent]
     board, names = Board(BOARD), {label(algo): algo for algo in LEARNERS}
     for entry in sorted(board.read().entries.values(), key=lambda entry: entry.id):
@@ -78,7 +78,7 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
 
 
 def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
-    """Return what is measured of an environment's agents: by agent and measure a number for each policy."""
+    """Return the measures of an environment's agents: for each agent and measure, a number per policy."""
     found: dict[str, dict[str, list[float | None]]] = {}
     for name, policies in agents(env_id):
         rows = [measures(record(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies]

@@ -1,4 +1,4 @@
-"""What the adapter gains over Stable-Baselines3's own `DummyVecEnv`: stepping alone, and in training.
+"""The adapter's speed-up over Stable-Baselines3's own `DummyVecEnv`: in stepping alone, and in training.
 
 ``python -m agents.bench`` measures both in turn, on one core, and prints medians and ratios.
 """
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kinds = {"adapter": adapter, "DummyVecEnv": dummy}
     steps = [Contestant(k, ENV, "step", n, partial(stepping, f, n)) for n in SIZES for k, f in kinds.items()]
     learn = [Contestant(k, ENV, "PPO", TRAINED, partial(training, f)) for k, f in kinds.items()]
-    # A sample of training is a roll-out and what is learnt from it, however short it is asked to be.
+    # A sample of training is at least one roll-out with its updates, however short a sample is requested.
     complete = measure(steps, args.rounds, 0.1) and measure(learn, args.rounds, 0.1)
     rows = [summary(ours, theirs) for ours, theirs in zip(*[iter(steps + learn)] * 2, strict=True)]
     print("\n".join(table(rows)))

@@ -1,7 +1,7 @@
 """Coarse value functions for the leaderboard's page: ``python -m agents.board_values [ID ...]``.
 
-Writes ``leaderboard/values/ID.json``: the largest return still to be had at the start of an episode, over two
-entries of the state; others are 0, and so is the target. Coarse grids are enough for a picture.
+Writes ``leaderboard/values/ID.json``: the largest attainable return at the start of an episode, over two
+entries of the state; the others are 0, and so is the target. Coarse grids are enough for a picture.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ POINTS = 61  #: along each axis
 
 
 def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
-    """Return an environment's value function as the page takes it.
+    """Return an environment's value function in the page's format.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
     -------
     dict
         ``axes``: two dicts with the state's name as ``label``, and ``low``, ``high``, ``n``; ``values``: n
-        rows of n numbers, by the first axis. Where most is lost the value is the same everywhere, so that
-        the other places can be told apart.
+        rows of n numbers, by the first axis. The lowest values are made equal, so that the others can be
+        told apart.
     """
     own = TASKS[env_id].value_iteration
     assert own is not None

@@ -1,8 +1,8 @@
-"""Cloning a controller in one file: a network learns what the controller would do wherever the network gets.
+"""Cloning a controller in one file: a network learns the controller's action in every state that it reaches.
 
-It needs no reward, and is as good as its expert at best. An iteration lets the network act and the controller
-watch (`Learner.collect`), and learns by regression from all that was seen so far (`Learner.update`). The
-algorithm is DAgger [1]_.
+It needs no reward, and is at best as good as its expert. In each iteration the network acts, the controller
+labels the states (`Learner.collect`), and the network learns by regression from all data collected so far
+(`Learner.update`). The algorithm is DAgger [1]_.
 
 References
 ----------
@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 
 
 class Settings(OwnSettings):
-    """What a training is made with; `lag_envs.hyperparams` has the values."""
+    """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
 
@@ -42,7 +42,7 @@ class Settings(OwnSettings):
     n_envs: int = Field(ge=1, description="environments stepped together")
     n_steps: int = Field(ge=1, description="steps of each environment between updates")
     n_updates: int = Field(ge=1, description="minibatches of an update")
-    batch_size: int = Field(ge=1, description="steps of a minibatch, drawn from all that was seen")
+    batch_size: int = Field(ge=1, description="steps of a minibatch, drawn from all collected data")
     learning_rate: float = Field(ge=0, description="of Adam at the start; it falls linearly to 0")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layer's weights at the start")
@@ -69,7 +69,7 @@ class Learner:
     """
 
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
-        torch.set_num_threads(1)  # the network is too small to share out
+        torch.set_num_threads(1)  # the network is too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
         self.rng = np.random.default_rng(seed)
@@ -82,7 +82,7 @@ class Learner:
         first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
         self.envs.reset(seed=first)
         self.observation, _ = stagger(self.envs, round(task.limit), first)
-        self.holds: Any = None  # what the controller remembers
+        self.holds: Any = None  # the controller's memory
         self.begun = np.ones(settings.n_envs, np.bool_)
         wide = self.observation.shape[1]
         self.seen, self.wanted = np.empty((0, wide), np.float32), np.empty((0, formulas.actions), np.float32)
@@ -91,26 +91,26 @@ class Learner:
         self.policy = Policy(shared_weights(self.actor), (), formulas.largest)
 
     def iterate(self) -> None:
-        """Collect what the controller would do, and learn it."""
+        """Collect the controller's actions, and learn them."""
         self.collect()
         self.update()
         self.trained += self.settings.n_envs * self.settings.n_steps
 
     def collect(self) -> None:
-        """Let the network act and the controller say what it would do; at first the controller acts."""
+        """Let the network act while the controller labels its states; at first the controller acts."""
         seen, wanted = [self.seen], [self.wanted]
         for _ in range(self.settings.n_steps):
             seen.append(self.observation)
             would, self.holds = self.expert.predict(self.observation, self.holds, self.begun)
             wanted.append(would)
-            # What is beyond the action space the environments clip.
+            # The environments clip actions beyond the action space.
             action = self.policy.outputs(self.observation)[1] if self.trained else would
             self.observation, _, terminated, truncated, _ = self.envs.step(action)
             self.begun = terminated | truncated
         self.seen, self.wanted = np.concatenate(seen), np.concatenate(wanted)
 
     def update(self) -> None:
-        """Learn from minibatches of all that was seen."""
+        """Learn from minibatches of all collected data."""
         s = self.settings
         seen, wanted = torch.from_numpy(self.seen), torch.from_numpy(self.wanted)
         self.adam.param_groups[0]["lr"] = s.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
@@ -129,7 +129,7 @@ class Learner:
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` returned; the same will follow, bit for bit."""
+        """Restore the result of `state`; the continuation is the same, bit for bit."""
         self.actor.load_state_dict(state["actor"])
         self.adam.load_state_dict(state["adam"])
         self.envs.set_state(state["envs"])

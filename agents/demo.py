@@ -1,6 +1,6 @@
 """Train a learner on an environment, compare it with controllers, and leave model, learning curve and video.
 
-``python -m agents.demo --help`` tells more. The training is that of `agents.train`.
+``python -m agents.demo --help`` has the options. The training is that of `agents.train`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lag_envs.tasks.registration import make_task
 
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
-EPILOG = """what is left in the output folder:
+EPILOG = """files in the output folder:
   model.zip            the policy: agents.learners.load_policy reads it
   learning_curve.png   returns while training, beside the controllers and the random policy
   episode.mp4          one fresh episode of the trained policy
@@ -41,8 +41,8 @@ Re-run it to resume where it was interrupted; a finished run is evaluated again.
 
 examples:
   python -m agents.demo                                  train on PivotedBar-v0, in seconds
-  python -m agents.demo --algo ppo --output runs/sb3     the same by Stable-Baselines3, in about a minute
-  python -m agents.demo --new --seed 7                   anew, with other random numbers
+  python -m agents.demo --algo ppo --output runs/sb3     the same with Stable-Baselines3, in about a minute
+  python -m agents.demo --new --seed 7                   again, with other random numbers
   python -m agents.demo --env ball_on_beam.py --output runs/ball"""
 
 

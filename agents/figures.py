@@ -1,4 +1,4 @@
-"""Figures of the agents' results: scores, learning curves, conditions, who is better than whom."""
+"""Figures of the agents' results: scores, learning curves, conditions, probabilities of improvement."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _what(env: Data) -> str:
 
 
 def scores_figure(envs: Mapping[str, Data]) -> Any:
-    """Draw each agent's result, and beside it that of acting ten times as often."""
+    """Draw each agent's result, with the result of acting ten times as often beside it."""
     figure, axes = _panels(envs, [0.9 + 0.3 * len(env["agents"]) for env in envs.values()])
     for ax, env in zip(axes, envs.values(), strict=True):
         lowest = LOWEST if env["known"] else _lowest(env["agents"])
@@ -121,7 +121,7 @@ def _lowest(agents: Mapping[str, Data]) -> float:
 
 
 def curves_figure(envs: Mapping[str, Data], over: str) -> Any:
-    """Draw what learners reach over the steps, or the seconds, of training."""
+    """Draw learners' results over the steps, or the seconds, of training."""
     shown = {i: e for i, e in envs.items() if any(a["kind"] == "learned" for a in e["agents"].values())}
     names = sorted({n for e in shown.values() for n, a in e["agents"].items() if a["kind"] == "learned"})
     styles = {
@@ -190,7 +190,7 @@ def improvement_figure(envs: Mapping[str, Data]) -> Any:
 
 
 def _heat(ax: Any, values: NDArray, low: float, high: float, text: Callable[[float], str]) -> None:
-    """Draw numbers as a table with colours; what is not known is grey."""
+    """Draw numbers as a table with colours; unknown ones are grey."""
     ax.set_facecolor("0.85")
     ax.imshow(values, cmap="cividis", vmin=low, vmax=high, aspect="auto")
     for (i, j), value in np.ndenumerate(values):

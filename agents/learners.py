@@ -1,6 +1,6 @@
 """Learners of Stable-Baselines3: hyperparameters, environments, interruptible training, policies.
 
-What has a file of its own is called from here too, so that commands need not know which is which.
+Learners with their own files are called from here too, so that commands can treat all learners alike.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from lag_envs.store import write
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.registration import make_task
 
-#: Where each learner's class is.
+#: The place of each learner's class.
 ALGORITHMS = {
     "ppo": ("stable_baselines3", "PPO"),
     "sac": ("stable_baselines3", "SAC"),
@@ -53,7 +53,7 @@ ALGORITHMS = {
     "dqn": ("stable_baselines3", "DQN"),
     "tqc": ("sb3_contrib", "TQC"),
 }
-#: Learners of our own: the module that trains each, and what tables call it.
+#: Learners of our own: the module that trains each, and its name in tables.
 OWN = {
     "fast_ppo": ("agents.ppo", "fast PPO"),
     "shac": ("agents.shac", "SHAC"),
@@ -68,12 +68,12 @@ TEST_EPISODES, EPISODES = 20, 100
 TESTS = 16
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 SCALE = "lag_envs.sb3.ScaledReward"
-#: Libraries whose versions a result tells.
+#: Libraries whose versions are stored in a result.
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
 
 
 def label(algo: str) -> str:
-    """Return what tables call a learner."""
+    """Return a learner's name in tables."""
     return {**ALGORITHMS, **OWN}[algo][1]
 
 
@@ -84,7 +84,7 @@ def learner(algo: str) -> type:
 
 
 def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[str, Any]:
-    """Return what the RL Zoo would read for an algorithm and environment.
+    """Return the RL Zoo's hyperparameters for an algorithm and environment.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
 
 
 def suits(algo: str, task: Task) -> bool:
-    """Tell whether a learner is made for a task's kind of actions: choices, or numbers."""
+    """Tell whether a learner supports a task's kind of actions: discrete or continuous."""
     choices = bool(task.formulas.choices)
     return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
 
@@ -134,7 +134,7 @@ class OwnSettings(Strict):
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Any]) -> Self:
-        """Return settings by name, or raise a UserError that says which is wrong."""
+        """Return settings by name, or raise a UserError that names the wrong one."""
         try:
             return checked(cls, dict(hyperparameters))
         except ValueError as error:
@@ -142,7 +142,7 @@ class OwnSettings(Strict):
 
 
 def trainable(env_id: str) -> Task:
-    """Return the task of an environment in which something can be learnt, or raise a UserError."""
+    """Return the task of an environment in which learning is possible, or raise a UserError."""
     task = make_task(env_id)
     if task.limit == math.inf:
         raise UserError(f"the episodes of {env_id} have no end; give it a duration to train")
@@ -200,7 +200,7 @@ def make_model(run: Run, envs: Any) -> Any:
     from stable_baselines3.common.noise import NormalActionNoise
     from stable_baselines3.common.utils import LinearSchedule
 
-    # The networks are too small to share out: a second thread costs more than it brings.
+    # The networks are too small for several threads: a second one costs more than it gains.
     torch.set_num_threads(1)
     own = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs")
     own += ("noise_type", "noise_std")
@@ -238,7 +238,7 @@ def make_model(run: Run, envs: Any) -> Any:
 
 
 def freeze(model: Any) -> dict[str, Any]:
-    """Return what Stable-Baselines3 keeps of a training: learner, normalisation, replay buffer."""
+    """Return the files that Stable-Baselines3 saves of a training: learner, normalisation, replay buffer."""
     file = io.BytesIO()
     model.save(file)
     return {
@@ -276,16 +276,16 @@ def thaw(run: Run, content: Mapping[str, Any]) -> Any:
 
 
 def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
-    """Train a run as far as it has not been trained, and write its result.
+    """Train the rest of a run, and write its result.
 
     Parameters
     ----------
     run : Run
-        The run; it goes on from its checkpoint, where there is one.
+        The run; it continues from its checkpoint, if there is one.
     show : callable
         Called often, with the run.
     tested : callable
-        Called when the policy was tested and a checkpoint written.
+        Called after each test of the policy, when its checkpoint has been written.
     """
     if run.algo in OWN:
         _train_own(run, show, tested)
@@ -296,7 +296,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
     model = make_model(run, make_envs(run)) if content is None else thaw(run, content)
     best = content and content["best"]
     model.get_env().reset()  # compiles
-    # Another seed has other episodes from the first to the last, and so has one that goes on.
+    # Every seed has different episodes throughout, and so does a resumed run.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
     every = run.steps / TESTS
 
@@ -313,12 +313,12 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
             return True
 
         def _on_rollout_start(self) -> None:
-            # Here the roll-out before has been learnt from.
+            # Here the learner has already been updated from the last roll-out.
             if not run.curve or self.num_timesteps - self.last >= every:
                 self.keep()
 
         def keep(self) -> None:
-            """Test the policy as it is, and save all; none of it is training."""
+            """Test the current policy and save everything; this does not count as training."""
             nonlocal best
             run.stop_clock()
             content = freeze(self.model)
@@ -336,7 +336,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
     watch = Watch()
     if run.trained < run.steps:
         run.start_clock()
-        # The learner adds what it has done before to the number of steps it is given.
+        # The learner adds its earlier steps to the number of steps it is given.
         model.learn(
             run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
         )
@@ -347,7 +347,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
 def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
     """Train with a learner of our own.
 
-    Tests on the way show how it goes. They neither stop the training nor choose what is kept of it.
+    Tests on the way show the progress. They neither stop the training nor select the policy that is kept.
     """
     content = run.load_checkpoint()
     module = import_module(OWN[run.algo][0])
@@ -388,7 +388,7 @@ def finish(run: Run, best: Mapping[str, Any]) -> None:
 
 
 def evaluate(run: Run, policy: Any, kept: int) -> None:
-    """Let the policy that a finished training had after some steps play fresh episodes; write the result."""
+    """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
     known = known_returns(run.env)
@@ -421,11 +421,11 @@ class Policy:
     Parameters
     ----------
     model : BaseAlgorithm
-        A learner; where its environments normalise observations, so does the policy.
+        A learner; if its environments normalise observations, so does the policy.
     normalise : VecNormalize, optional
         The normalisation, for a learner that was loaded without environments.
     bins : bool
-        Whether actions that are numbers stand for parts of [-1, 1], and are not the environment's own.
+        Whether action numbers stand for parts of [-1, 1] instead of being the environment's own actions.
     """
 
     def __init__(self, model: Any, normalise: Any = None, bins: bool = True) -> None:
@@ -461,7 +461,7 @@ def load_policy(folder: Path) -> Any:
     Raises
     ------
     UserError
-        Where the folder holds no finished run, or a damaged one.
+        If the folder holds no finished run, or a damaged one.
     """
     result = read_result(folder / RESULT)
     try:

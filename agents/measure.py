@@ -1,4 +1,4 @@
-"""Who is measured, under which conditions, and measurements that are kept as soon as they are there."""
+"""The agents to measure, the conditions, and measurements, each stored as soon as it is done."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ AGENTS = Path(__file__).parent
 OPTIMA = AGENTS / "results" / "optimum"
 CONTROLLERS = Path(controllers.__file__).parent
 EXPORT = Path(export.__file__)
-#: Episodes of agents that take long, where something is changed.
+#: Episodes of slow agents under changed conditions.
 PLANNED = 200
-#: First seed of the episodes of random actions from which the noise's size is taken.
+#: First seed of the episodes of random actions that determine the size of the noise.
 NOISE_SEED = 3_000_000_000
 
 # --- who is measured ----------------------------------------------------------------------------------------
@@ -49,18 +49,18 @@ NOISE_SEED = 3_000_000_000
 
 @dataclass(frozen=True)
 class Entrant:
-    """One policy: of an agent that is not trained, or of one training run.
+    """One policy: an untrained agent's, or the result of one training run.
 
     Parameters
     ----------
     env, name, kind : str
         Id of the environment, name of the agent, and "classical", "optimal" or "learned".
     make : callable
-        Returns the policy; without arguments.
+        Returns the policy; takes no arguments.
     mark : str
-        Changes with what decides how it acts.
+        Changes with everything that determines how the policy acts.
     run : dict, optional
-        What ``result.json`` holds, for a learner.
+        The contents of ``result.json``, for a learner.
     plans : bool
         Whether it plans before each episode, which takes long.
     """
@@ -84,7 +84,7 @@ class Entrant:
 
 
 def no_optimum(env_id: str) -> str:
-    """Return why there is no optimal policy; nothing where there is one."""
+    """Return why there is no optimal policy; empty if there is one."""
     try:
         from agents.optimum import played
     except ImportError:
@@ -135,7 +135,7 @@ def learned(env_id: str, folder: Path) -> Entrant:
 
 
 def check_alike(entrant: Entrant, first: Entrant) -> None:
-    """Raise a UserError where two runs of a learner were not trained alike, and so are no two samples."""
+    """Raise a UserError if two runs of a learner were trained differently: they are not alike as samples."""
     assert entrant.run is not None and first.run is not None
     for name in ("steps", "hyperparameters"):
         if entrant.run[name] != first.run[name]:
@@ -145,7 +145,7 @@ def check_alike(entrant: Entrant, first: Entrant) -> None:
 
 
 def digest(*files: Path | str) -> str:
-    """Return what changes with the files; names are modules or folders in `agents`."""
+    """Return a digest of the files; names are modules or folders in `agents`."""
     total = hashlib.sha256()
     for file in files:
         path = file if isinstance(file, Path) else AGENTS / file
@@ -167,39 +167,39 @@ class Job:
 
     @property
     def key(self) -> str:
-        """What the returns are found by again: all that decides them."""
+        """The key under which the returns are stored: everything that determines them."""
         c, e = self.condition, self.entrant
         what = [e.env, e.name, e.seed, e.mark, c.options, c.noise, c.late, self.episodes, __version__]
         return hashlib.sha256(json.dumps([*what, FIRST_FRESH_SEED, SCHEMA]).encode()).hexdigest()[:24]
 
     @property
     def steps(self) -> int:
-        """Steps that it takes at most."""
+        """The largest number of steps."""
         return self.condition.steps(self.entrant.env) * self.episodes
 
 
 class Evaluation:
-    """The agents of an environment, and what was measured of them.
+    """The agents of an environment, and their measurements.
 
-    Measurements are kept as soon as they are there, a line of JSON each; a damaged one is made again.
+    Each measurement is stored as soon as it is done, as a line of JSON; a damaged one is repeated.
 
     Parameters
     ----------
     env_id : str
         The environment.
     runs : Path
-        Where learners' runs and the measurements lie.
+        Folder of the learners' runs and the measurements.
 
     Attributes
     ----------
     entrants : list of Entrant
         The classical controllers, the optimal policy and the learners' runs, each agent's side by side.
     absent, broken : list of str
-        Agents that are not there, and those with which something is wrong.
+        Agents that are missing, and agents with a problem.
     returns : dict of str to list of float
         By the key of a `Job`.
     noise : ndarray, shape (n_observation,)
-        What the observation's noise is relative to.
+        Scale of the observation noise.
     """
 
     def __init__(self, env_id: str, runs: Path) -> None:
@@ -239,16 +239,16 @@ class Evaluation:
             self.absent.append("learners: no finished run")
 
     def jobs(self, names: Sequence[str] | None, episodes: int, changed: int | None = None) -> list[Job]:
-        """Return what is measured of agents of some names.
+        """Return the measurements to make for the named agents.
 
         Parameters
         ----------
         names : sequence of str, optional
             The agents; by default all.
         episodes : int
-            How many are played.
+            Number of episodes.
         changed : int, optional
-            At most so many where something is changed; by default `PLANNED` of agents that plan.
+            Largest number under changed conditions; by default `PLANNED` for agents that plan.
         """
 
         def count(entrant: Entrant, condition: Condition) -> int:
@@ -269,14 +269,14 @@ class Evaluation:
         return Rollout(self.env, agent, fresh_seeds(job.episodes), sensor, **found.options).run(tick)
 
     def keep(self, job: Job, returns: NDArray) -> None:
-        """Keep a measurement."""
+        """Store a measurement."""
         about = {"key": job.key, "agent": str(job.entrant), "condition": job.condition.name}
         row = about | {"returns": rounded(returns.tolist())}
         store.append(self.file, row)
         self.returns[job.key] = row["returns"]
 
     def measured(self, jobs: Iterable[Job]) -> Iterator[Data]:
-        """Yield for each agent what `summarise_env` takes, from those of the jobs that were done."""
+        """Yield the input of `summarise_env` for each agent, from the finished jobs."""
         order = [condition.name for condition in conditions(self.env)]
         for name, group in groupby(jobs, key=lambda job: job.entrant.name):
             entrants, policies = [], []
@@ -298,7 +298,7 @@ class Evaluation:
 
 
 def _timed(run: Data) -> Data:
-    """Return a run with its seconds on the processor, which what else the machine does hardly lengthens."""
+    """Return a run with its processor seconds, which other load on the machine hardly affects."""
     wall = run["wall_seconds"]
     seconds = run.get("processor_seconds", wall)  # earlier versions did not count them
     share = seconds / wall if wall else 1.0
@@ -312,7 +312,7 @@ def _where(run: Data) -> str:
 
 
 def measure(todo: Sequence[tuple[Evaluation, Job]]) -> None:
-    """Measure, policy by policy, and show how far it is and what is left."""
+    """Measure, policy by policy, and show the progress."""
     from tqdm import tqdm
 
     total, started = sum(job.steps for _, job in todo), time.monotonic()

@@ -1,6 +1,6 @@
 """The optimum of every task, computed: value iteration where the state has 2 or 3 dimensions, else bounds.
 
-``python -m agents.optimum --help`` tells more.
+``python -m agents.optimum --help`` has the options.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT_FOLDER = Path("runs/optimum")
 RESULTS, IMAGES = ROOT / "agents" / "results" / "optimum", ROOT / "docs" / "images"
-#: Versions of the results, and of what is cached.
+#: Versions of the results, and of the cache.
 SCHEMA, CACHED = 2, 1
-#: Episodes that are compared.
+#: Number of episodes compared.
 EPISODES = 1_000
 
 HELP = """value iteration keeps V_t, the largest return still to be had with t steps taken, at the nodes of a
@@ -110,7 +110,7 @@ def grid(problem: ValueIteration, level: float, target: float | None = None) -> 
 
 
 def solvable() -> dict[str, ValueIteration]:
-    """Return what is solved on a grid of its own, by id."""
+    """Return the problems that are solved on their own grid, by id."""
     found = {env_id: task.value_iteration for env_id, task in TASKS.items()}
     return {env_id: problem for env_id, problem in found.items() if problem and problem.axes}
 
@@ -136,7 +136,7 @@ class Solution:
     quiet : bool
         Whether to show no progress.
     problem : ValueIteration, optional
-        What is solved, where it is not what the task says.
+        The problem, if it differs from the task's.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class Solution:
         self.keep = list(problem.keep or range(self.n_state))
         self.steps = int(self.task.limit)
         self.kick: Kick | None = self._kick if problem.pushes else None
-        #: The targets asked for last, and the nodes of the axis that follows them: they last for an episode.
+        #: The last targets, and the nodes of the axis that follows them: they last for an episode.
         self._asked: Array = np.empty(0)
         self._own: Array = np.empty((0, 0))
         self.programs, self.values, self.seconds = [], [], 0.0
@@ -174,7 +174,7 @@ class Solution:
     def program(self, target: float | None) -> Programme:
         """Return the dynamic programme for a target."""
         problem = self.problem
-        # Not in the fingerprint: what happens between the places where the step is tried.
+        # The fingerprint does not cover the step between the points where it is evaluated.
         parameters = {
             "schema": CACHED, "env": self.env_id, "options": dict(problem.options), "target": target,
             "level": self.level, "pushes": problem.pushes, "constants": self.task.formulas.constants(),
@@ -196,7 +196,7 @@ class Solution:
         return ends[:, self.keep], rewards, ended
 
     def _kick(self, points: Array) -> tuple[Array, Array]:
-        """Return where no kick and kicks of all sizes lead, and how likely they are."""
+        """Return the outcomes of no kick and of kicks of all sizes, with their probabilities."""
         states, pushes = self.states(points), self.problem.pushes
         chance = self.task.chance(0.01)
         # The first random number decides whether there is a kick, the second one its size.
@@ -231,8 +231,8 @@ class Solution:
         for k in range(len(known)):
             for rows, weight in ((lower == k, 1.0 - part), (lower + 1 == k, part)):
                 if rows.any():
-                    # Points are moved to where they lie among the nodes of target k as they do among their
-                    # own target's: so the target, and the edge at which an episode ends, have their like.
+                    # Points are mapped to the same place among the nodes of target k as among their own
+                    # target's, so that targets and the edges at which episodes end correspond.
                     there, axis = points[rows], self._moving
                     there[:, axis] = carried(
                         there[:, axis], self._own, own[rows], self.programs[k].grid.axes[axis]
@@ -275,12 +275,12 @@ class Optimal(LookAhead):
     env_id : str
         Id of an environment that value iteration solves.
     level : float, optional
-        How fine the grid is; the finest that `python -m agents.optimum` uses. What is not in the cache is
-        computed, which takes a moment.
+        How fine the grid is; by default the finest that `python -m agents.optimum` uses. Values that are not
+        in the cache are computed, which takes a moment.
     folder : Path, optional
         The cache.
     solution : Solution, optional
-        Instead of all that: a solution at hand.
+        An existing solution, in place of all these.
 
     Examples
     --------
@@ -310,7 +310,7 @@ class Optimal(LookAhead):
 
     def _value(self, ends: Array, targets: Array, taken: Array) -> Array:
         solution = self.solution
-        # The margin is for a clock that has gone tenths of a step.
+        # The margin allows for the rounding of a clock that advances by tenths of a step.
         after = np.minimum((taken + 1e-6).astype(np.int64) + 1, solution.steps)
         return solution.expected(after, ends[:, solution.keep], targets if solution.problem.targets else None)
 
@@ -319,13 +319,13 @@ class Optimal(LookAhead):
 
 
 def starts(env_id: str, episodes: int = EPISODES) -> tuple[Array, Array | None]:
-    """Return states and targets at the start of the episodes that agents are compared on."""
+    """Return states and targets at the start of the episodes on which agents are compared."""
     rollout = Rollout(env_id, None, fresh_seeds(episodes))
     return rollout.state, rollout.target
 
 
 def proved_bound(env_id: str) -> tuple[float, str]:
-    """Return what no policy exceeds in the mean over the starts, and why."""
+    """Return an upper bound on any policy's mean return over the starts, and its reason."""
     task: Task = TASKS[env_id]()
     if task.optimum is None:
         return task.limit, "steps of an episode; no step pays more than 1"
@@ -335,17 +335,17 @@ def proved_bound(env_id: str) -> tuple[float, str]:
 
 
 def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
-    """Extrapolate values on grids each twice as fine as the one before to cells without width.
+    """Extrapolate values on grids, each twice as fine as the one before, to zero cell width.
 
     Returns
     -------
     limit : float
-        The limit by the order of the error that the last three values show, kept between 1 and 2.
+        The limit, by the order of convergence that the last three values show, clipped to between 1 and 2.
     error : float
-        What the last halving of the cells changed. If the error falls with an order of 1 or more, it is at
-        most that on the finest grid, and an order that is misjudged moves the limit by less.
+        The change by the last halving of the cells. If the order is at least 1, the error on the finest grid
+        is at most this, and a misjudged order moves the limit by less.
     order : float
-        The order; 1 where there are not three values, or where they do not converge evenly.
+        The order; 1 if there are not three values, or if they do not converge evenly.
 
     Examples
     --------
@@ -368,7 +368,7 @@ def parameters(task: Task) -> dict[str, float]:
 
 
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
-    """Solve what an environment needs, and return its numbers."""
+    """Solve the problems that an environment needs, and return its numbers."""
     own = TASKS[env_id].value_iteration
     if own is None:
         raise UserError(f"{env_id} has no grid to solve on; give its task a value_iteration")
@@ -428,7 +428,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
 
 
 def explanation(env_id: str, source: str, problem: ValueIteration, grids: Sequence[dict[str, Any]]) -> str:
-    """Return in words how the numbers came about."""
+    """Describe in words how the numbers were computed."""
     sizes = ", ".join(" x ".join(map(str, grid["nodes"])) for grid in grids)
     text = (
         f"Finite-horizon value iteration on grids of {sizes} nodes with {problem.actions} actions, "
@@ -548,7 +548,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
-        # What others are relaxed to comes first, so that it is there.
+        # Tasks that serve as relaxations of others are solved first.
         known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
         able = [env_id for env_id, problem in known.items() if problem or TASKS[env_id].plans is not None]
         last = {env_id for env_id in able if known[env_id] and known[env_id].relaxed}
@@ -571,7 +571,7 @@ def _interrupt(number: int, frame: Any) -> None:
 
 
 def work(env_id: str, args: argparse.Namespace) -> None:
-    """Compute, write and draw one environment's optimum; plan where there is no grid to compute it on."""
+    """Compute, write and draw one environment's optimum; if it has no grid, plan instead."""
     if TASKS[env_id].plans is not None:
         from agents import plans, scale  # they play what is found here
 

@@ -1,4 +1,4 @@
-"""Plans for tasks that no grid can solve: found from random guesses, and chosen by what they get.
+"""Plans for tasks that no grid can solve: found from random guesses, and selected by their returns.
 
 ``python -m agents.optimum`` calls this for tasks that have `Task.plans`.
 """
@@ -19,26 +19,26 @@ from lag_envs.controllers.tracking import Tracking, file_of, search
 from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.evaluation.statistics import mean_and_error
 
-#: Seeds of the guesses, and how many plans from each are tried: the most promising ones.
+#: Seeds of the guesses, and the number of the most promising plans tried from each.
 SEEDS, PROMISING = range(3), 6
-#: Seeds of nobody else's episodes, and how many of them decide which plan is kept.
+#: Seeds of episodes that nothing else uses, and the number of episodes that decide which plan is kept.
 FIRST_SEED, EPISODES = 3_500_000_000, 200
-#: Starts that decide which plan is the best to begin planning from.
+#: Starts that decide which plan is the best initial guess.
 STARTS = 8
 
 
 def candidates(env_id: str, seeds: Iterable[int], **changes: Any) -> Iterable[Tracking]:
-    """Yield the most promising plans from each seed, as what follows them."""
+    """Yield controllers that follow the most promising plans of each seed."""
     for seed in seeds:
         yield from islice(search(TASKS[env_id](), seed, **changes), PROMISING)
 
 
 def find(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) -> None:
-    """Find an environment's plans, and write them where controllers read them, or into a folder.
+    """Find an environment's plans, and write them to the place where controllers read them, or into a folder.
 
-    One is for following from any start, and the one with the best mean over fresh starts is kept. The other
-    is the best to begin from where each episode is planned anew. A task that follows another's plans has none
-    of its own.
+    One plan is followed from any start: the one with the best mean return over fresh starts. The other is the
+    best initial guess if each episode is planned anew. A task that follows another's plans has none of its
+    own.
     """
     task, began = TASKS[env_id](), time.monotonic()
     if task.plans.of:
@@ -59,7 +59,7 @@ def find(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) 
     gains = []
     for agent in guesses:
         planner = replan(task, guesses=[agent])
-        # Of the steps beyond the plan's end, each is worth 1 but for what its tail counts.
+        # Each step beyond the plan's end is worth 1, less the cost of the tail.
         gains.append(planner.plan(starts, np.zeros(STARTS))[1].mean() + task.limit - planner.steps)
     guesses[int(np.argmax(gains))].save(file_of(task, "quick", folder))
     seconds = time.monotonic() - began

@@ -1,7 +1,7 @@
 """Proximal policy optimisation in one file of plain PyTorch: read it from top to bottom.
 
-``python -m agents.ppo --help`` tells more. An iteration lets the policy act in all environments
-(`Learner.collect`), estimates by how much each action was better than expected (`Learner.advantages`), and
+``python -m agents.ppo --help`` has the options. An iteration lets the policy act in all environments
+(`Learner.collect`), estimates how much better each action was than expected (`Learner.advantages`), and
 makes better actions more likely, within limits (`Learner.update`). The algorithm is that of [1]_, with the
 estimator of [2]_ and the exploration of [3]_.
 
@@ -48,7 +48,7 @@ Array = NDArray[np.float32]
 
 
 class Settings(OwnSettings):
-    """What a training is made with; `lag_envs.hyperparams` has the values."""
+    """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
 
@@ -64,7 +64,7 @@ class Settings(OwnSettings):
     ent_coef: float = Field(ge=0, description="weight of the entropy in the loss")
     vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
     max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
-    reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
+    reward_scale: float = Field(ge=0, description="factor of the rewards")
     episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which that noise is held")
@@ -100,16 +100,16 @@ def shared_weights(layers: nn.Sequential) -> list[tuple[Array, Array]]:
 
 
 class Policy:
-    """What acts: a network's weights as NumPy sees them. For small batches that is faster than PyTorch.
+    """The acting policy: a network's weights as NumPy arrays, faster than PyTorch for small batches.
 
     Parameters
     ----------
     layers : sequence of (weight, bias)
         Arrays (out, in) and (out,) of each layer.
     choices : tuple of int
-        How many values each action is chosen from; empty where actions are numbers.
+        The number of values to choose from, for each action; empty for continuous actions.
     largest : float
-        The largest of these numbers, and minus the lowest.
+        The largest continuous action; the lowest is minus this.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Policy:
         return hidden, hidden @ weight.T + bias
 
     def chosen(self, preferences: NDArray) -> NDArray[np.int64]:
-        """Return which value of each action is preferred, (n, actions), or (n,) for a single one."""
+        """Return the index of the preferred value of each action, (n, actions), or (n,) for a single one."""
         parts = np.split(preferences, np.cumsum(self.choices)[:-1], axis=-1)
         values = [part.argmax(axis=-1) for part in parts]
         return values[0] if len(values) == 1 else np.stack(values, axis=-1)
@@ -160,7 +160,7 @@ class Policy:
 
     @classmethod
     def load(cls, path: Path) -> Policy:
-        """Return what `save` wrote."""
+        """Return the policy that `save` wrote."""
         with np.load(path, allow_pickle=False) as found:
             count = sum(name.startswith("weight_") for name in found)
             layers = [(found[f"weight_{k}"], found[f"bias_{k}"]) for k in range(count)]
@@ -168,11 +168,11 @@ class Policy:
 
 
 class Continuous:
-    """Actions that are numbers: Gaussian around the actor's outputs, with noise held for some steps.
+    """Continuous actions: Gaussian around the actor's outputs, with noise held for some steps.
 
     The noise is features · E, where E (features, actions) is drawn with a learned standard deviation of each
     entry. Features are the actor's last hidden layer (gSDE), or 1, so that the noise does not depend on the
-    state. What is beyond the action space the environment clips.
+    state. The environment clips actions beyond the action space.
     """
 
     def __init__(self, settings: Settings, actions: int) -> None:
@@ -191,7 +191,7 @@ class Continuous:
         return means + np.einsum("nf,nfa->na", features, self.exploration)
 
     def log_prob(self, features: Tensor, means: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the actions' log probability density and the entropy, but for constants, (n,) each."""
+        """Return the actions' log probability density and the entropy, up to constants, (n,) each."""
         features = features.detach() if self.by_state else torch.ones_like(features[:, :1])
         variance = features.square() @ (2.0 * self.log_std).exp() + 1e-6
         log = variance.log()
@@ -199,7 +199,7 @@ class Continuous:
 
 
 class Choices:
-    """Actions that are chosen from lists: the actor puts out a logit for each value of each list."""
+    """Discrete actions: the actor outputs a logit for each value of each list."""
 
     def __init__(self, policy: Policy) -> None:
         self.policy = policy
@@ -221,14 +221,14 @@ class Choices:
 
 
 class Rollout(NamedTuple):
-    """What n environments did in T steps."""
+    """The experience of n environments in T steps."""
 
     observations: Array  #: (T + 1, n, n_observation)
     actions: NDArray  #: (T, n, n_actions)
     rewards: Array  #: (T, n)
     terminated: NDArray[np.bool_]  #: (T, n)
     over: NDArray[np.bool_]  #: (T, n)
-    final: Array  #: (T, n, n_observation); last observations of episodes, where they are over
+    final: Array  #: (T, n, n_observation); last observations of episodes, at the steps at which they end
 
 
 class Learner:
@@ -247,7 +247,7 @@ class Learner:
     """
 
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
-        torch.set_num_threads(1)  # the networks are too small to share out
+        torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
         self.rng = np.random.default_rng(seed)
@@ -309,9 +309,9 @@ class Learner:
 
     @torch.no_grad()
     def advantages(self, found: Rollout) -> tuple[Array, Array]:
-        """Return the advantages of the actions and what the critic should have said, (T, n) each.
+        """Return the advantages of the actions and the critic's targets, (T, n) each.
 
-        An episode that is truncated would have gone on: its last observation's value stands for the rest.
+        A truncated episode would have continued: the value of its last observation stands for the rest.
         """
         values = self.critic(torch.from_numpy(found.observations)).numpy()[..., 0]
         following = values[1:].copy()
@@ -326,7 +326,7 @@ class Learner:
         return advantages, advantages + values[:-1]
 
     def update(self, found: Rollout, advantages: Array, targets: Array) -> None:
-        """Improve actor and critic by some epochs of Adam on what was collected."""
+        """Improve actor and critic by some epochs of Adam on the collected experience."""
         s, body, last = self.settings, self.actor[:-1], self.actor[-1]
         self.adam.param_groups[0]["lr"] = s.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
         observations = torch.from_numpy(found.observations[:-1].reshape(advantages.size, -1))
@@ -359,7 +359,7 @@ class Learner:
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` returned; the same will follow, bit for bit."""
+        """Restore the result of `state`; the continuation is the same, bit for bit."""
         with torch.no_grad():
             self.parameters.copy_(torch.from_numpy(state["parameters"]))
         self.adam.load_state_dict(state["adam"])
@@ -386,7 +386,7 @@ examples:
   python -m agents.ppo examples/ball_on_beam.py            a task of your own; this runs the file
 """
 
-#: Settings that are options; n_timesteps is --steps.
+#: Settings that are command-line options; n_timesteps is --steps.
 OPTIONS = [name for name in Settings.model_fields if name != "n_timesteps"]
 
 
@@ -416,7 +416,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def truth(text: str) -> bool:
-    """Return what yes or no means."""
+    """Return the value of yes or no."""
     if text not in ("yes", "no"):
         raise argparse.ArgumentTypeError(f"must be yes or no, got {text!r}")
     return text == "yes"
@@ -430,7 +430,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     changed = {name: value for name, value in given.items() if value is not None}
     runs = plan(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
-        Settings.of(run.hyperparameters)  # better now than when another seed is trained
+        Settings.of(run.hyperparameters)  # fail now, not after another seed has been trained
     todo = [run for run in runs if run.load_result() is None]
     failed, stopped = follow(todo, here) if todo else ({}, False)
     summarise([run for run in runs if run.name not in failed])

@@ -1,6 +1,6 @@
 """Learners side by side on one environment: their scores against the time that training takes.
 
-``python -m agents.race --help`` tells more.
+``python -m agents.race --help`` has the options.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     p = argparse.ArgumentParser(
         prog="python -m agents.race",
-        description="Train learners side by side, and tell when they reach which score.",
+        description="Train learners side by side, and report when each reaches which score.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -137,7 +137,7 @@ def train(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def told(row: dict[str, Any]) -> str:
-    """Return in a line how a training went."""
+    """Return a one-line summary of a training."""
     when = ", ".join(
         f"{level:g} never" if (time := reached(row["curve"], level)) is None else f"{level:g} in {time:.1f} s"
         for level in LEVELS
@@ -146,7 +146,7 @@ def told(row: dict[str, Any]) -> str:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """Return the cells of the table: for each learner and level how many reached it, and when."""
+    """Return the cells of the table: for each learner and level, how many seeds reached it, and when."""
     names = list(dict.fromkeys(row["algo"] for row in rows))
     last = f"of {label(names[-1])}'s"
     cells: list[tuple[str, ...]] = [("", "level", "reached", "steps", "s", "s on the processor", last)]

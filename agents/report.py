@@ -58,9 +58,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     parts.append(_image("agents-scores.png", "Results of all agents with intervals"))
     if data["learners"]:
         parts += ["### Learners", _learners_table(data["learners"], envs)]
-        parts.append(
-            "What a learner's policy reaches in the course of its training, over steps and over seconds:"
-        )
+        parts.append("Results of learners' policies during training, over steps and over seconds:")
         parts.append(_image("agents-steps.png", "Learning curves over steps"))
         parts.append(_image("agents-seconds.png", "Learning curves over seconds"))
         parts.append(
@@ -96,17 +94,17 @@ def summary(data: Data) -> str:
 
 def _reading(data: Data) -> str:
     return (
-        "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best policy"
-        " known, which need not be the optimum. Where no range is known, the return itself stands there."
+        "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best known"
+        " policy, which need not be optimal. If no range is known, the tables show the return itself."
         " Learners: interquartile mean over training seeds, and in brackets its"
         f" {100 * LEVEL:g} % interval by a stratified bootstrap; mean return ± standard error over seeds"
-        " (a single run is treated like what follows). Behind a learner's name stands what it had, in"
-        " figures as seeds × thousands of steps: one seed says nothing of the next, and with fewer steps a"
-        " learner is no match for one with more."
-        " The others have no training seed, so what varies is the episode: mean, 1.96 standard errors"
+        " (a single run is treated like the other agents). A learner's name is followed by its seeds and"
+        " steps, in figures as seeds × thousands of steps: one seed says nothing about the next, and a"
+        " learner with fewer steps cannot be compared with one with more."
+        " Other agents have no training seeds, so only the episodes vary: mean, 1.96 standard errors"
         " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
-        " a tenth; it shows what exploits the discretisation. *Worst*: the lowest result under changed"
-        " parameters, noise and delay. *Training*: processor time of one run."
+        " a tenth; it reveals policies that exploit the discretisation. *Worst*: the lowest result under"
+        " changed parameters, noise and delay. *Training*: processor time of one run."
     )
 
 
@@ -123,7 +121,7 @@ def _range(env_id: str, env: Data) -> str:
         f"{what} {plus_minus(row['mean'], row['error'])} in {row['episodes']:,} episodes"
         for what, row in (
             ("random actions", found["random"]),
-            (f"{policy}, the best policy known,", found[policy]),
+            (f"{policy}, the best known policy,", found[policy]),
         )
     ]
     return f"{text} Measured (`python -m agents.scale`): {'; '.join(told)}."
@@ -153,7 +151,7 @@ def _env_table(env: Data, episodes: int) -> str:
 
 
 def _times(env: Data) -> list[str]:
-    """Tell when learners first reached the levels in a test."""
+    """Return a table of when learners first reached the levels in a test."""
     rows = []
     for name, agent in env["agents"].items():
         if "reached" not in agent:
@@ -167,12 +165,12 @@ def _times(env: Data) -> list[str]:
         rows.append(row)
     if not rows:
         return []
-    text = "Seeds whose tests reached a score, and the median of all seeds' first such tests:"
+    text = "Seeds whose tests reached a score, and the median over all seeds of the first such test:"
     return [text, markdown_table(["learner", *(f"{level:g}" for level in LEVELS)], rows)]
 
 
 def labelled(name: str, agent: Data) -> str:
-    """Return an agent's name, and of a learner what it had: with one seed, or few steps, it is no match.
+    """Return an agent's name, for a learner with its seeds and steps.
 
     Examples
     --------
@@ -186,7 +184,7 @@ def labelled(name: str, agent: Data) -> str:
 
 
 def brief(name: str, agent: Data) -> str:
-    """Return an agent's name as figures have it, with a learner's seeds and thousands of steps.
+    """Return an agent's name for figures, for a learner with its seeds and thousands of steps.
 
     Examples
     --------
@@ -199,7 +197,7 @@ def brief(name: str, agent: Data) -> str:
 
 
 def _behaviour(env_id: str) -> list[str]:
-    """Tell what `python -m agents.behaviour` measured."""
+    """Return the measurements of `python -m agents.behaviour`."""
     if not BEHAVIOUR.exists():
         return []
     found = json.loads(BEHAVIOUR.read_text(encoding="utf-8"))
@@ -222,11 +220,11 @@ def _behaviour(env_id: str) -> list[str]:
         for name, by in agents.items()
     ]
     text = (
-        f"In the same {found['episodes']:,} episodes (`python -m agents.behaviour`): means, where"
-        " nothing else is said; of learners the range of their seeds."
+        f"In the same {found['episodes']:,} episodes (`python -m agents.behaviour`): means, unless"
+        " stated otherwise; for learners the range over their seeds."
     )
     if any(name.startswith("lost") for name in head):
-        text += " *Lost* is what rewards lack to 1 per step."
+        text += " *Lost* is the sum of 1 minus the reward over the steps."
     return [text, markdown_table(head, rows)]
 
 
@@ -248,8 +246,8 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
             ]
         )
     text = (
-        "Over all environments with a score, each resampled by itself. **This is no comparison of"
-        " algorithms**: look at what each had; compare only equal environments, seeds and steps."
+        "Over all environments with a score, each resampled by itself. **This is not a comparison of"
+        " algorithms**: compare only results with the same environments, seeds and steps."
     )
     head = ["learner", f"score ({100 * LEVEL:g} %)", "environments", "seeds of each", "steps of a seed"]
     return text + "\n\n" + markdown_table(head, rows)
@@ -276,42 +274,46 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
         and (found["value"] != 0.5 or one < other)
     ]
     if not rows:
-        return "All runs of the one are better than all of the other, in every case."
-    text = f"Neither 0 nor 1, with {100 * LEVEL:g} % interval; two learners in the likelier order:"
+        return "In every pair, all runs of one agent are better than all runs of the other."
+    text = (
+        f"Probabilities other than 0 and 1, with {100 * LEVEL:g} % interval; two learners in the likelier"
+        " order:"
+    )
     return text + "\n\n" + markdown_table(["environment", "learner", "better than", "probability"], rows)
 
 
 def _method(data: Data) -> str:
     return "\n".join(
         [
-            f"- Episodes: {data['episodes']:,} under each condition, where a table says nothing else. They"
-            f" are seeded {data['first_seed']:,} and on, which training and tuning never use; the same for"
-            " all agents. Agents act deterministically.",
+            f"- Episodes: {data['episodes']:,} under each condition, unless a table says otherwise. Their"
+            f" seeds start at {data['first_seed']:,}, are never used in training and tuning, and are the same"
+            " for all agents. Agents act deterministically.",
             *_fewer(data),
-            "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their seconds;"
-            " running rewards and the chance of a kick are scaled with `dt`. Kicks, where there are any, are"
-            " others then, and an agent does not have the same luck.",
-            "- *Parameters*: each of the scene's 20 % lower and higher, the others as they are; a moment of"
-            " inertia that is not given follows mass and size. The agents stay those of the environment as it"
-            " is, and so does the range of scores: part of a loss, or gain, is the changed task's.",
+            "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their length in"
+            " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if any, differ"
+            " then, so an agent's luck differs too.",
+            "- *Parameters*: each of the scene's parameters 20 % lower and higher, the others unchanged; a"
+            " moment of inertia that is not given follows mass and size. The agents, and the range of scores,"
+            " are still those of the unchanged environment: part of a loss, or gain, comes from the changed"
+            " task itself.",
             "- *Noise*: Gaussian, drawn anew for each entry of the observation at each step, with a standard"
-            " deviation of 1 % and 5 % of what the entry itself has over random actions (100 episodes).",
+            " deviation of 1 % and 5 % of the entry's own under random actions (100 episodes).",
             "- *Late*: the agent sees the observation of the step before.",
-            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, strata being the"
-            " environments and elements the seeds, as in rliable (Agarwal et al., NeurIPS 2021), with whose"
-            " functions tests compare ours. The probability of improvement compares runs: an agent that was"
-            " not trained is one run. Learning curves are of 20 test episodes with other seeds, and straight"
+            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, with environments as strata and"
+            " seeds as elements, as in rliable (Agarwal et al., NeurIPS 2021); tests compare our functions"
+            " with rliable's. The probability of improvement compares runs: an agent that was"
+            " not trained is one run. Learning curves use 20 test episodes with other seeds, and are linear"
             " between tests.",
             "- *First tests*: a run has 16, so a score may have been reached up to a sixteenth of the run"
-            " earlier, and 20 episodes may be lucky ones. Seconds are processor time of training"
-            " alone, on one core (of policies from before November 2026 wall time)."
+            " earlier, and the 20 episodes may be lucky. Seconds are processor time of training"
+            " alone, on one core (wall time for policies from before November 2026)."
             " `python -m agents.race` tests more often, one run at a time.",
         ]
     )
 
 
 def _fewer(data: Data) -> list[str]:
-    """Tell which agents took too long for all episodes."""
+    """Return which agents were too slow to play all episodes."""
     found: dict[tuple[str, int], None] = {}
     for env_id, env in data["envs"].items():
         fewer = {}
@@ -326,8 +328,8 @@ def _fewer(data: Data) -> list[str]:
         return []
     names = ", ".join(f"{name} in {n:,} episodes only" for name, n in found)
     return [
-        f"- Under changed conditions {names}. Returns there are moved by as much as the agent's return in"
-        " these episodes differs from its return in all, both without the change."
+        f"- Under changed conditions {names}. Returns there are corrected by the difference between the"
+        " agent's return in these episodes and in all, both without the change."
     ]
 
 
@@ -354,7 +356,7 @@ def _about(data: Data) -> str:
 
 
 def _optimum(env_id: str) -> list[str]:
-    """Tell what `python -m agents.optimum` found, with its picture."""
+    """Return the results of `python -m agents.optimum`, with its picture."""
     file = OPTIMA / f"{env_id}.json"
     if not file.exists():
         return []
@@ -363,18 +365,18 @@ def _optimum(env_id: str) -> list[str]:
     easier = "" if lower is not None else f" of {found['solved']}, which is easier,"
     if bound["exact"]:
         first = (
-            f"It is known: {bound['value']:.4f} in the mean over the starts of {found['episodes']:,}"
-            f" episodes, {bound['why']}. No policy exceeds it; one that acts at intervals just misses it."
+            f"It is known: {bound['value']:.4f} on average over the starts of {found['episodes']:,}"
+            f" episodes, {bound['why']}. No policy exceeds it; one that acts at intervals falls just short."
         )
     else:
-        first = f"Proved is only that it is at most {bound['value']:.4g}: {bound['why']}."
+        first = f"The only proved bound is that it is at most {bound['value']:.4g}: {bound['why']}."
     if estimate is None:
         second = f"Value iteration{easier} gives no estimate: its own policy gets more."
     else:
         second = (
             f"Value iteration{easier} estimates {plus_minus(estimate['value'], estimate['error'])} for the"
-            f" starts of {found['episodes']:,} episodes: extrapolated to a grid without width, with an error"
-            " bar of what the last halving of the cells changed. That is no proof."
+            f" starts of {found['episodes']:,} episodes: extrapolated to zero cell width, with the change by"
+            " the last halving of the cells as error bar. This is not a proof."
         )
     parts = [first, second]
     if lower is not None:
@@ -391,16 +393,17 @@ def _optimum(env_id: str) -> list[str]:
 
 
 def adapter() -> str:
-    """Tell what `python -m agents.bench` measured of our `VecEnv`."""
+    """Return the measurements of our `VecEnv` by `python -m agents.bench`."""
     found = json.loads(ADAPTER.read_text(encoding="utf-8"))
     rows = []
     for row in found["rows"]:
         adapter, dummy = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
         rows.append([row["kind"], str(row["num_envs"]), adapter, dummy, f"{row['ratio'][1]:.1f}"])
     text = (
-        f"`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
-        f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
-        f" {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes the most time."
+        "`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single environments:"
+        f" {found['env']}, steps per second on one core of {found['machine']['processor']}, {found['date']};"
+        f" medians of {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes most of"
+        " the time."
     )
     return text + "\n\n" + markdown_table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
 
@@ -414,7 +417,7 @@ def _image(file: str, text: str) -> str:
 
 
 def number(value: float) -> str:
-    """Return a result with as many digits as say something.
+    """Return a result with its meaningful digits.
 
     Examples
     --------
@@ -427,7 +430,7 @@ def number(value: float) -> str:
 
 
 def with_interval(found: Mapping[str, float]) -> str:
-    """Return a value with its interval, where it has one."""
+    """Return a value with its interval, if it has one."""
     if found["low"] is None or math.isnan(found["low"]):
         return number(found["value"])
     return f"{number(found['value'])} ({number(found['low'])}, {number(found['high'])})"

@@ -1,6 +1,6 @@
 """Measure all agents on all environments, and write the results, figures and page that this project commits.
 
-``python -m agents.results --help`` tells more.
+``python -m agents.results --help`` has the options.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from lag_envs.store import write
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
-#: What has the table of the best agents.
+#: The page with the table of the best agents.
 TRAINING = "docs/training.md"
 #: Episodes under each condition, and with --quick.
 EPISODES, QUICK = 1000, 20
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
 
-EPILOG = f"""what it reads and writes:
+EPILOG = f"""files read and written:
   RUNS/ENV/ALGO/seed<K>/       policies that `python -m agents.train` left (default runs/)
-  RUNS/measurements/ENV.jsonl  what has been measured; it is not measured again
+  RUNS/measurements/ENV.jsonl  finished measurements; they are not repeated
   OUTPUT/{SUMMARY}   all numbers
   OUTPUT/{PAGE}        the page, with figures in OUTPUT/{PICTURES}
-  OUTPUT/docs/training.md     the table in it, where there is one
+  OUTPUT/docs/training.md     the table in it, if there is one
 
-It can be interrupted at any time; re-run it to resume. Agents that are not there now (other machines'
-runs, say) keep the numbers that the summary has of them. Commands for different --envs may run side by side.
+It can be interrupted at any time; re-run it to resume. Agents that are missing now (such as other machines'
+runs) keep their numbers in the summary. Commands for different --envs may run side by side.
 """
 
 
@@ -58,9 +58,9 @@ def parser() -> argparse.ArgumentParser:
         "--output", type=Path, metavar="FOLDER", help="default: this checkout; with --quick, RUNS/quick"
     )
     p.add_argument("--episodes", type=int, metavar="N", help=f"under each condition (default {EPISODES})")
-    p.add_argument("--changed", type=int, metavar="N", help="at most N where something is changed")
+    p.add_argument("--changed", type=int, metavar="N", help="at most N under changed conditions")
     p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether everything works")
-    p.add_argument("--new", action="store_true", help="forget what the summary has of other agents")
+    p.add_argument("--new", action="store_true", help="discard other agents' numbers in the summary")
     p.add_argument("--redraw", action="store_true", help="measure nothing: figures and page from the summary")
     return p
 
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.changed is not None and args.changed < 1:
             raise UserError(f"--changed must be at least 1, got {args.changed}")
         if not args.new:
-            load_summary(output)  # better now than when all is measured
+            load_summary(output)  # fail now, not after everything has been measured
         with terminable():
             found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
             # Only now: another command may have written it meanwhile.
@@ -107,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int, changed: int | None
 ) -> list[tuple[Evaluation, list[Job]]]:
-    """Measure what has not been measured; return the environments with all that there is to measure."""
+    """Make the missing measurements; return the environments with everything to measure."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
     evaluations = [Evaluation(env_id, runs) for env_id in envs]
@@ -127,7 +127,7 @@ def measure_all(
 
 
 def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old: Data) -> Data:
-    """Return all that page and figures need; agents that were not measured now keep their old numbers."""
+    """Return everything that page and figures need; agents not measured now keep their old numbers."""
     envs = dict(old.get("envs", {}))
     for evaluation, jobs in found:
         envs[evaluation.env] = summarise_evaluation(evaluation, jobs, envs.get(evaluation.env))
@@ -148,7 +148,7 @@ def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old:
 
 
 def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[Job], before: Data | None) -> Data:
-    """Return the summary of an environment, with what an earlier one has of other agents."""
+    """Return the summary of an environment, with other agents' numbers from an earlier one."""
     env_id = evaluation.env
     found = rounded(summarise_env(evaluation.measured(jobs), known_returns(env_id)))
     if before is not None and before["known"] == found["known"]:
@@ -171,7 +171,7 @@ def to_json(data: Data) -> str:
 
 
 def load_summary(output: Path, needed: bool = False) -> Data:
-    """Return the summary that is in an output folder; an empty one where there is none and none is needed."""
+    """Return the summary in an output folder; an empty one if there is none and none is needed."""
     file = output / SUMMARY
     if not file.exists():
         if needed:

@@ -1,8 +1,8 @@
 """One training run in its folder: settings, progress, checkpoint and result.
 
-A folder holds ``checkpoint.pkl`` while the run is not finished (everything that is needed to go on),
-then ``model.zip`` and ``result.json``. Files are replaced whole, so a kill at any moment leaves a readable
-folder.
+A folder holds ``checkpoint.pkl`` while the run is not finished (everything that is needed to resume),
+then ``model.zip`` and ``result.json``. Files are replaced as a whole, so a kill at any moment leaves a
+readable folder.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from lag_envs.errors import UserError, hint
 from lag_envs.store import write
 
 SCHEMA = 1
-#: Seeds of the episodes on which agents are compared, and of those on which a policy is tested while it is
-#: trained. Training never comes near them.
+#: Seeds of the episodes on which agents are compared, and of those on which a policy is tested during
+#: training. Training itself never uses them.
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
@@ -40,12 +40,12 @@ def fresh_seeds(episodes: int) -> range:
 
 @dataclass
 class Run:
-    """A run's settings and how far it has come.
+    """A run's settings and progress.
 
     Parameters
     ----------
     folder : Path
-        Where everything of the run lies.
+        Folder of all the run's files.
     env, algo, seed, steps : str, str, int, int
         Id of the environment, name of the learner, seed, steps to train for.
     hyperparameters : dict
@@ -61,7 +61,7 @@ class Run:
     #: The file or module of the user's own environment, as it was given; empty for one of the package.
     source: str = ""
     trained: int = 0
-    #: Of training alone, without compiling, tests and evaluation: on the clock, and on the processor.
+    #: Times of training alone, without compiling, tests and evaluation: wall time and processor time.
     seconds: float = 0.0
     processor_seconds: float = 0.0
     #: Steps so far, seconds so far, mean return of the policy then.
@@ -70,13 +70,13 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What a checkpoint must have been made with."""
+        """The settings that a checkpoint must have been made with."""
         names = ("env", "algo", "seed", "steps", "hyperparameters")
         return {"schema": SCHEMA} | {name: getattr(self, name) for name in names}
 
     @property
     def name(self) -> str:
-        """How messages call the run."""
+        """The run's name in messages."""
         return f"{self.env} {self.algo} seed {self.seed}"
 
     def path(self, name: str) -> Path:
@@ -84,30 +84,30 @@ class Run:
         return self.folder / name
 
     def start_clock(self) -> None:
-        """Begin to count time as that of training."""
+        """Start the clock of training time."""
         self.since = time.perf_counter(), time.process_time()
 
     def stop_clock(self) -> None:
-        """Add the time since then to that of training."""
+        """Stop the clock, and add its time to the training time."""
         self.seconds += time.perf_counter() - self.since[0]
         self.processor_seconds += time.process_time() - self.since[1]
 
     # --- files ----------------------------------------------------------------------------------------------
 
     def save_checkpoint(self, content: dict[str, Any]) -> None:
-        """Write everything that is needed to go on."""
+        """Write everything that is needed to resume."""
         names = ("trained", "seconds", "processor_seconds", "curve")
         progress = {name: getattr(self, name) for name in names}
         data = pickle.dumps({"settings": self.settings, "progress": progress, **content})
         write(self.path(CHECKPOINT), data)
 
     def load_checkpoint(self) -> dict[str, Any] | None:
-        """Return the checkpoint and take its progress over, or return None where there is none.
+        """Return the checkpoint and adopt its progress, or return None if there is none.
 
         Raises
         ------
         UserError
-            For a file that cannot be read or that another run left.
+            For a file that cannot be read or that belongs to another run.
         """
         file = self.path(CHECKPOINT)
         if not file.exists():
@@ -133,7 +133,7 @@ class Run:
         return content
 
     def check_settings(self, found: dict[str, Any], file: Path) -> None:
-        """Raise UserError where a file belongs to a run with other settings."""
+        """Raise UserError if a file belongs to a run with other settings."""
         for name, value in self.settings.items():
             if found.get(name) != value:
                 what = f"{name} {found.get(name)!r}, not {value!r}"
@@ -159,7 +159,7 @@ class Run:
 
 
 def read_result(file: Path) -> dict[str, Any]:
-    """Return what a run's ``result.json`` holds.
+    """Return the contents of a run's ``result.json``.
 
     Raises
     ------
@@ -180,19 +180,19 @@ def read_result(file: Path) -> dict[str, Any]:
 
 
 def check_env(env_id: str) -> str:
-    """Return the id of an environment of the package, or raise a UserError that knows what was meant."""
+    """Return the id of an environment of the package, or raise a UserError that suggests similar ids."""
     return check_name("environment", env_id, TASKS)
 
 
 def own_env(name: str) -> str:
-    """Return the id that a name means: one of the package's, ``module:Id``, ``FILE`` or ``FILE:Class``.
+    """Return the id for a name: one of the package's, ``module:Id``, ``FILE`` or ``FILE:Class``.
 
-    A file or module of one's own is run, and what it defines registered.
+    A user's file or module is run, and the environments that it defines are registered.
 
     Raises
     ------
     UserError
-        Where there is none, or several.
+        If there is none, or several.
     """
     import gymnasium as gym
 
@@ -212,7 +212,7 @@ def own_env(name: str) -> str:
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return a name that is known, or raise a UserError with those that are close."""
+    """Return a known name, or raise a UserError with similar ones."""
     known = list(known)
     if name in known:
         return name
@@ -220,7 +220,7 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
 
 
 def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Let a command's function print a UserError, and return 2 then."""
+    """Make a command's function print a UserError and return 2."""
 
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)

@@ -1,12 +1,12 @@
-"""Measure the mean returns that scores and the leaderboard's references are set to.
+"""Measure the mean returns that define scores and the leaderboard's references.
 
-``python -m agents.scale`` plays, for each environment, random actions, no control, the best policy known and
-the board's reference, and prints means and standard errors beside the numbers in use. A policy that takes
-long plays the first of the episodes only, and the luck in them is taken out by what the reference gets there
-and in all (a control variate); what the reference is set to comes from other episodes, independent of all
-that. ``--output src/lag_envs/tasks/measured.json`` keeps the numbers, and README shows them: what is in use
-stays, an environment without gets its own. The best known is then the best of its controllers and of the
-learners that were trained, of each of which the seed that ended best plays.
+``python -m agents.scale`` plays, for each environment, random actions, no control, the best known policy and
+the board's reference, and prints means and standard errors beside the numbers in use. A slow policy plays
+only the first episodes, and its luck is corrected by the reference's returns in these and in all episodes (a
+control variate). The reference's own number comes from other, independent episodes. ``--output
+src/lag_envs/tasks/measured.json`` stores the numbers: those in use stay, and an environment without any gets
+new ones. Its best known policy is then the best of its controllers and of the trained learners, each of
+which plays with the seed that ended best.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from lag_envs.tasks.measured import measured as of_package
 
 Array = NDArray[np.float64]
 
-#: Seeds of nobody else, and those of the references' own means; episodes that are played together.
+#: Seeds that nothing else uses, and those of the references' own means; episodes that are played together.
 FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
-#: Episodes of policies that take long: that plan, that look ahead by value iteration.
+#: Episodes of slow policies: those that plan, and those that look ahead by value iteration.
 PLANNED, OPTIMAL = 1_000, 4_096
 
 
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="N",
         help="episodes of a policy that plans (default %(default)s)",
     )
-    p.add_argument("--quick", action="store_true", help="leave out policies that take long")
+    p.add_argument("--quick", action="store_true", help="leave out slow policies")
     p.add_argument(
         "--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="learners' runs (default runs/)"
     )
@@ -105,25 +105,25 @@ def measured(
     env_id : str
         The environment.
     batches : int
-        Of `size` episodes.
+        Number of batches of `size` episodes.
     quick : bool
-        Whether to leave out policies that take long.
+        Whether to leave out slow policies.
     kept : dict, optional
-        What `lag_envs.tasks.measured` has of it.
+        Its entry in `lag_envs.tasks.measured`.
     size : int
         Episodes of a batch, `BATCH` at most.
     planned : int
         Episodes of a policy that plans.
     runs : Path
-        Where learners' runs are.
+        Folder of the learners' runs.
 
     Returns
     -------
     dict
-        The same anew: ``scale`` and ``reference`` as they are, or from this measurement where they are
-        missing; ``measured`` by policy ``mean``, standard ``error`` and the ``episodes`` that it played;
-        "reference" is the board's, "optimum", where it is known, what no policy exceeds, and "privileged"
-        the reference of a task that is open.
+        The updated entry: ``scale`` and ``reference`` unchanged, or from this measurement if they are
+        missing; ``measured`` holds for each policy its ``mean``, standard ``error`` and number of
+        ``episodes``. "reference" is the board's, "optimum", if it is known, the largest possible return, and
+        "privileged" the reference of an open task.
     """
     kept, task = dict(kept or {}), TASKS[env_id]()
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
@@ -177,7 +177,7 @@ def measured(
 
 
 def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
-    """Return of each learner the seed with the best mean return at the end of its training, by its label."""
+    """Return each learner's seed with the best mean return at the end of its training, by its label."""
     found: dict[str, Entrant] = {}
     best: dict[str, float] = {}
     for file in sorted(runs.glob(f"{env_id}/*/seed*/{RESULT}")):
@@ -189,7 +189,7 @@ def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
 
 
 def many(env_id: str, agent: Any, batches: int, size: int, first: int = FIRST_SEED, **options: Any) -> Array:
-    """Return a quick policy's returns, in the environment with these keywords."""
+    """Return a fast policy's returns, in the environment with these keywords."""
     firsts = (first + k * BATCH for k in range(batches))
     return np.concatenate([play(env_id, agent, range(first, first + size), **options) for first in firsts])
 

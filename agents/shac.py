@@ -1,14 +1,15 @@
-"""Short-horizon actor-critic in one file: a policy improved by the exact gradient of what it earns.
+"""Short-horizon actor-critic in one file: a policy improved by the exact gradient of its return.
 
-The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing need be tried out: an
-iteration lets the policy act for a window of some steps (`Learner.collect`), computes by how much each action
-changes all later rewards of its window (`Learner.gradients`), and moves the policy along (`Learner.update`).
-What comes after the window a critic estimates. The algorithm is that of [1]_, with one addition: derivatives
-that have grown beyond `max_slope` are scaled back to it at each step. Without a critic, and with windows as
-long as episodes, it is back-propagation through time, also called analytic policy gradients.
+The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing has to be tried out. In
+each iteration the policy acts for a window of some steps (`Learner.collect`), the derivatives of all later
+rewards in the window with respect to each action are computed (`Learner.gradients`), and the policy follows
+the gradient (`Learner.update`). A critic estimates the rewards after the window. The algorithm is that of
+[1]_, with one addition: at each step, derivatives larger than `max_slope` are scaled back to it. Without a
+critic, and with windows as long as episodes, it is back-propagation through time, also called analytic policy
+gradients.
 
-PyTorch sees a window as one batch. The derivatives of all its steps are computed at once, for the states are
-known by then; what is left to do backwards is a recursion of small matrices in NumPy.
+For PyTorch a window is one batch. The derivatives of all its steps are computed at once, because the states
+are known by then; the backward pass is only a recursion of small matrices in NumPy.
 
 References
 ----------
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 
 
 class Settings(OwnSettings):
-    """What a training is made with; `lag_envs.hyperparams` has the values."""
+    """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
 
@@ -52,7 +53,7 @@ class Settings(OwnSettings):
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
     max_slope: float = Field(gt=0, description="largest norm of the derivatives by a state and action")
-    reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
+    reward_scale: float = Field(ge=0, description="factor of the rewards")
     episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
     start_ranges: dict[str, NonNegativeFloat] = Field(description="half widths of states about the usual")
@@ -62,7 +63,7 @@ class Settings(OwnSettings):
     critic_rate: float = Field(ge=0, description="learning rate of the critic")
     critic_epochs: int = Field(ge=1, description="passes over a window in which the critic learns")
     batch_size: int = Field(ge=1, description="steps of a minibatch of these")
-    td_lambda: float = Field(ge=0, le=1, description="decay of the weights of later steps in what it learns")
+    td_lambda: float = Field(ge=0, le=1, description="decay of the weights of later steps in its targets")
 
     @model_validator(mode="after")
     def _fit(self) -> Self:
@@ -75,14 +76,14 @@ class Settings(OwnSettings):
 
 
 class Window(NamedTuple):
-    """What n environments did in T steps."""
+    """The experience of n environments in T steps."""
 
     observations: NDArray[np.float32]  #: (T, n, n_observations), before each step
     seen: NDArray[np.float32]  #: (T, n, n_observations), after it
     before: Array  #: (T, n, n_state)
     after: Array  #: (T, n, n_state)
     targets: Array  #: (T, n, n_targets)
-    actions: NDArray[np.float32]  #: (T, n, n_actions), as the policy has them, not clipped
+    actions: NDArray[np.float32]  #: (T, n, n_actions), the policy's, not clipped
     rewards: Array  #: (T, n)
     terminated: NDArray[np.bool_]  #: (T, n)
     over: NDArray[np.bool_]  #: (T, n)
@@ -105,11 +106,11 @@ class Learner:
     Raises
     ------
     UserError
-        For an environment without derivatives, and for start ranges of states that it does not have.
+        For an environment without derivatives, and for start ranges of unknown states.
     """
 
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
-        torch.set_num_threads(1)  # the networks are too small to share out
+        torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
         self.rng = np.random.default_rng(seed)
@@ -123,8 +124,8 @@ class Learner:
             raise UserError(f"start_ranges: {env_id} has no state {unknown[0]!r}; it has {', '.join(names)}")
         self.half_widths = np.array([settings.start_ranges.get(name, 0.0) for name in names])
         self.envs: Any = gym.make_vec(env_id, settings.n_envs, autoreset_mode="Disabled").unwrapped
-        # Another seed has other episodes from first to last. Where windows are shorter than episodes, first
-        # episodes end one after the other, for a window should see all phases.
+        # Every seed has different episodes throughout. If windows are shorter than episodes, the first
+        # episodes end at staggered times, so that each window contains all phases.
         self.observation, _ = self.envs.reset(seed=1_000_000 * seed % FIRST_FRESH_SEED)
         self.limit = max(1, round(settings.episode_share * self.task.limit))
         ages = np.arange(settings.n_envs) * self.limit // settings.n_envs
@@ -182,19 +183,19 @@ class Learner:
     def gradients(self, w: Window) -> Array:
         """Return the derivatives by each action of the discounted rewards that follow it, (T, n, n_actions).
 
-        They are by actions as the environment takes them, clipped. An episode that is cut goes on in the
-        critic. Backwards in time, the derivatives by x and a, a step's state and action, follow from those by
-        x' and a', the next ones, of which a' depends on o'(x'), what is seen:
+        They are with respect to the clipped actions. For an episode that is cut, the critic stands for the
+        rest. Backwards in time, the derivatives with respect to x and a, a step's state and action, follow
+        from those with respect to the next ones, x' and a', where a' depends on the observation o'(x'):
 
             d/d(x, a) = ∂r/∂(x, a) + γ (d/dx' · ∂x'/∂(x, a) + d/da' · ∂a'/∂o' · ∂o'/∂(x, a))
 
-        What is multiplied here is known for all steps beforehand, and computed at once.
+        The factors here are known for all steps beforehand, and computed at once.
         """
         (steps, n, wide), many, gamma = w.before.shape, w.actions.shape[2], self.settings.gamma
         going = ~w.over  # where the next step is one of the window
         going[-1] = False
-        # A step's results of which derivatives are taken: each entry of the next state, each next action, and
-        # the reward, together with the critic's value where no step follows.
+        # The differentiated results of a step: each entry of the next state, each next action, and
+        # the reward, together with the critic's value if no step follows.
         kinds = wide + many + 1
         by_states = np.zeros((kinds, steps, n, wide))
         by_seen = np.zeros((kinds, *w.seen.shape))
@@ -213,15 +214,15 @@ class Learner:
         for t in reversed(range(steps)):
             passed = np.einsum("nk,knj->nj", later * going[t][:, None], by_both[:-1, t])
             total = by_both[-1, t] + gamma * passed
-            # What grows from step to step, as near an unstable balance and at kinks, would drown all else.
+            # Derivatives that grow from step to step, near an unstable balance or at kinks, would dominate.
             size = np.linalg.norm(total, axis=1, keepdims=True)
             later = found[t] = total / np.maximum(1.0, size / self.settings.max_slope)
         return found[..., wide:]
 
     def through_step(self, w: Window, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:
-        """Return gradients by the steps' results as those by their states and actions.
+        """Convert gradients with respect to steps' results to those with respect to their states and actions.
 
-        Of each step several are given, (kinds, T, n, ...), and returned, (kinds, T, n, n_state + n_actions).
+        Each step has several, given as (kinds, T, n, ...), returned as (kinds, T, n, n_state + n_actions).
         """
         kinds, task = len(by_rewards), self.task
 
@@ -247,7 +248,7 @@ class Learner:
     def update(self, w: Window, by_actions: Array) -> None:
         """Move the policy along the gradient.
 
-        What is beyond the largest action it moves back, but never further out.
+        Actions beyond the largest one are moved back, never further out.
         """
         outwards = (w.actions != self.clipped(w.actions)) & (by_actions * w.actions > 0.0)
         wanted = np.where(outwards, 0.0, by_actions / w.rewards.size).astype(np.float32)
@@ -259,7 +260,7 @@ class Learner:
         adam.step()
 
     def learn_values(self, w: Window) -> None:
-        """Let the critic learn the discounted rewards that follow what is seen, TD(λ)."""
+        """Let the critic learn the discounted rewards after each observation, TD(λ)."""
         s = self.settings
         with torch.no_grad():
             following = self.critic(torch.from_numpy(w.seen)).numpy()[..., 0] * ~w.terminated
@@ -290,7 +291,7 @@ class Learner:
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` returned; the same will follow, bit for bit."""
+        """Restore the result of `state`; the continuation is the same, bit for bit."""
         for net, values in zip((self.actor, self.critic), state["networks"], strict=True):
             net.load_state_dict(values)
         for adam, values in zip(self.adams, state["adams"], strict=True):
@@ -301,7 +302,7 @@ class Learner:
 
 
 def slopes(network: nn.Module, seen: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the derivatives of a network's outputs by its inputs, (n_outputs, ..., n_inputs)."""
+    """Return the Jacobian of a network's outputs with respect to its inputs, (n_outputs, ..., n_inputs)."""
     inputs = torch.from_numpy(seen).requires_grad_()
     outputs = network(inputs).unbind(-1)
     found = [torch.autograd.grad(x.sum(), inputs, retain_graph=True)[0].numpy() for x in outputs]

@@ -1,6 +1,6 @@
 """Make leaderboard submissions of all our agents: learners, controllers and optimal policies.
 
-``python -m agents.submit --help`` tells more.
+``python -m agents.submit --help`` has the options.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from lag_envs.leaderboard.submission import Refused, Submission, load, write
 Array = NDArray[np.float64]
 AUTHORS, LICENSE = ["the lag_envs authors"], "MIT"
 
-HELP = """what is made, a folder each, in OUT:
-  ENV-ALGO              from RUNS/ENV/ALGO/seed*/, where five seeds or more are finished
+HELP = """submissions made, a folder each, in OUT:
+  ENV-ALGO              from RUNS/ENV/ALGO/seed*/, if at least five seeds are finished
   ENV-CONTROLLER        every one of lag_envs.controllers
   ENV-optimal           the value functions of `python -m agents.optimum`, coarsened to a table
 
-A folder that is there is kept, so that re-running resumes; --new makes it again."""
+Existing folders are kept, so that re-running resumes; --new makes them again."""
 
 
 # --- optimal ------------------------------------------------------------------------------------------------
@@ -56,11 +56,11 @@ def tabulate(solution: Solution) -> tuple[dict[str, Any], dict[str, Array]]:
     problem, states = solution.problem, solution.task.scene.state_names
     axes, names = [], []
     for axis, name in zip(problem.axes, states, strict=True):
-        if axis.centre == "target":  # so far the target's mirror image may be away
+        if axis.centre == "target":  # the target's mirror image may be this far away
             axis = replace(axis, low=axis.low - max(problem.targets), centre=0.0)
             name += " - target"
         found = nodes(axis, axis.level, None)
-        if axis.periodic:  # an angle that is observed by cosine and sine lies within half a turn
+        if axis.periodic:  # an angle observed by its cosine and sine lies within half a turn
             found = found - 0.5 * (found[0] + found[-1])
         axes.append(found[found >= -1e-12] if name == problem.mirror else found)
         names.append(name)
@@ -91,11 +91,11 @@ def optimal(
     env_id : str
         One for which value iteration gives a policy.
     folder : Path
-        Where to; must not exist.
+        Destination; must not exist.
     cache : Path, optional
-        Where `agents.optimum` keeps values; what is not there is computed.
+        Cache of `agents.optimum`; missing values are computed.
     solution : Solution, optional
-        One at hand, instead.
+        An existing solution, instead.
     """
     solution = solution or Solution(env_id, solvable()[env_id].levels[-1], cache)
     policy, arrays = tabulate(solution)
@@ -135,7 +135,7 @@ def controller(env_id: str, name: str, folder: Path) -> Submission:
 
 
 def entrants(env_id: str, runs: Path, cache: Path) -> Iterator[tuple[str, Callable[[Path], Submission]]]:
-    """Yield for all agents of an environment the name, and what writes its submission to a folder."""
+    """Yield, for each agent of an environment, its name and a function that writes its submission."""
     for name in controllers(TASKS[env_id]):
         yield name, partial(controller, env_id, name)
     if env_id in played() and (cache / env_id).is_dir():
@@ -167,7 +167,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--optimum", type=Path, default=DEFAULT_FOLDER, metavar="FOLDER", help="default %(default)s"
     )
-    p.add_argument("--new", action="store_true", help="make again what is there")
+    p.add_argument("--new", action="store_true", help="make existing submissions again")
     return p
 
 

@@ -1,6 +1,6 @@
 """Train learners on environments, several seeds side by side, here or on a Ray cluster.
 
-``python -m agents.train --help`` tells more.
+``python -m agents.train --help`` has the options.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ from lag_envs.store import write
 from lag_envs.tables import columns
 from lag_envs.workers import SpreadError, check_address, died
 
-EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
+EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
   model.zip            the policy: stable_baselines3's load reads it, agents.learners.load_policy plays it
   tensorboard/         for `tensorboard --logdir FOLDER`
-  {CHECKPOINT}       while the run is not finished: all that is needed to go on ({TESTS} times a run)
+  {CHECKPOINT}       while the run is not finished: everything needed to resume ({TESTS} times a run)
 
-Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; seeds that are finished are left
-as they are. A run goes on from its last checkpoint, in other episodes than without the interruption.
-Policies of SAC, TD3, TQC and DQN come and go while they learn: what is left is the one that did best in a
-test, on episodes of their own. Of PPO it is the last one.
+Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; finished seeds are left as they are.
+A run resumes from its last checkpoint, with different episodes than without the interruption.
+Policies of SAC, TD3, TQC and DQN get better and worse while they learn: the one that did best in a test, on
+separate episodes, is kept. For PPO it is the last one.
 
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
@@ -63,7 +63,7 @@ examples:
   python -m agents.train PivotedBar-v0 --seeds 10               ten seeds, as many at once as there are cores
   python -m agents.train PivotedBar-v0 --algo sac td3 --seeds 5
   python -m agents.train examples/ball_on_beam.py               a task of your own; this runs the file
-  python -m agents.train all --seeds 5                          what docs/agents.md is made from
+  python -m agents.train all --seeds 5                          the runs behind docs/agents.md
   python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   the same, spread over a Ray cluster
 """
 
@@ -174,7 +174,7 @@ def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType
 
 
 def work(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
-    """Train one run and tell how it goes; return why it failed, nothing where all went well.
+    """Train one run and report its progress; return why it failed, or nothing on success.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def work(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
     tell : callable
         Given ("steps", name, steps), ("tested", name, curve) and ("file", name, file, bytes).
     ship : bool
-        Whether to tell the files too, for a run whose folder nobody else sees.
+        Whether to send the files too, for a run whose folder is not shared.
     """
     last = 0.0
 
@@ -203,7 +203,7 @@ def work(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
         tell(("tested", run.name, run.curve))
 
     try:
-        if run.source:  # in this process it may not be registered yet
+        if run.source:  # its environment may not be registered in this process yet
             own_env(run.source)
         train(run, show=show, tested=tested)
         send(MODEL, NORMALISATION, RESULT)
@@ -302,7 +302,7 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
 
 
 def follow(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str], bool]:
-    """Train the runs and show how they go; return why which failed, and whether it was stopped."""
+    """Train the runs and show their progress; return the failures, and whether it was stopped."""
     from tqdm import tqdm
 
     failed: dict[str, str] = {}
@@ -371,7 +371,7 @@ def summarise(runs: Sequence[Run]) -> None:
 
 
 def command(module: str, arguments: Sequence[str] | None) -> str:
-    """Return the command that is running, without what would start it anew."""
+    """Return the running command, without options that would start it over."""
     python = Path(sys.executable)
     if python.is_relative_to(Path.cwd()):
         python = python.relative_to(Path.cwd())

@@ -1,6 +1,6 @@
-"""Find numbers of controllers and settings of our PPO, on seeds that no evaluation uses.
+"""Tune numbers of controllers and settings of our PPO, on seeds that no evaluation uses.
 
-``python -m agents.tune --help`` tells more.
+``python -m agents.tune --help`` has the options.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lag_envs.tasks import TASKS
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
 FIRST_TUNING_SEED = 3_000_000_000
 LEARNER = "fast_ppo"
-#: What is tried of each setting. A setting that is drawn keeps its value with probability 1/2.
+#: Values tried for each setting. In a random draw, a setting keeps its value with probability 1/2.
 CHOICES: Mapping[str, Sequence[Any]] = {
     "learning_rate": (1e-3, 2e-3, 3e-3, 5e-3, 8e-3),
     "n_envs": (64, 128, 256),
@@ -56,12 +56,12 @@ CHOICES: Mapping[str, Sequence[Any]] = {
     "first_layer_scale": (1.0, 2.0, 3.0),
 }
 RESULTS = ROOT / "agents" / "results" / "tuning"
-EPILOG = f"""By default the numbers of the environment's controllers are looked for, by differential
-evolution, and printed; those that are the controllers' defaults were found in this way.
+EPILOG = f"""By default the numbers of the environment's controllers are tuned by differential evolution,
+and printed; the controllers' defaults were found in this way.
 
-With --settings settings of {LEARNER} are tried: first the task's own, then others that are drawn at random,
-each with some training seeds. FILE keeps every training, so that the command can be interrupted and run
-again, also with more --settings or --seeds. What is best goes by hand into the task's `hyperparameters`.
+With --settings, settings of {LEARNER} are tried: first the task's own, then others drawn at random,
+each with some training seeds. FILE stores every training, so that the command can be interrupted and run
+again, also with more --settings or --seeds. Copy the best settings by hand into the task's `hyperparameters`.
 
 examples:
   python -m agents.tune PivotedBar-v0 --only "energy shaping + LQR"
@@ -70,7 +70,7 @@ examples:
 
 
 def tunable(env_id: str) -> dict[str, Mapping[str, tuple[float, float]]]:
-    """Return what can be tuned: by controller between which values each number is looked for."""
+    """Return the search ranges of the numbers that can be tuned, by controller."""
     return {name: found.tune for name, found in TASKS[env_id].controllers.items() if found.tune}
 
 
@@ -92,7 +92,7 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
 
 
 def drawn(number: int) -> dict[str, Any]:
-    """Return what the setting of a number changes; number 0 changes nothing."""
+    """Return the changes of a numbered setting; number 0 changes nothing."""
     rng = np.random.default_rng(number)
     changed = {}
     for name, values in CHOICES.items():
@@ -103,7 +103,7 @@ def drawn(number: int) -> dict[str, Any]:
 
 
 def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episodes: int) -> dict[str, Any]:
-    """Train one seed with changed settings; return how good it got, and how long it took."""
+    """Train one seed with changed settings; return its final return and its time."""
     learners.TESTS, learners.EPISODES = 8, 1
     hyper = {**hyperparameters(LEARNER, env_id), **changed}
     with tempfile.TemporaryDirectory() as folder:
@@ -119,7 +119,7 @@ def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episod
 
 
 def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path) -> Any:
-    """Try settings that have not been tried, side by side; return all that was tried."""
+    """Try untried settings, side by side; return everything tried so far."""
     own = hyperparameters(LEARNER, env_id)
     about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
     about["changed_from"] = own
@@ -145,7 +145,7 @@ def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs:
 
 
 def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return what an earlier search left, or None; raise a UserError for another search's file."""
+    """Return the results of an earlier search, or None; raise a UserError for another search's file."""
     if not file.exists():
         return None
     try:
@@ -189,7 +189,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     p = argparse.ArgumentParser(
         prog="python -m agents.tune",
-        description="Find numbers of controllers or settings of a learner, on seeds that no evaluation uses.",
+        description="Tune numbers of controllers or settings of a learner, on seeds that no evaluation uses.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,12 +1,12 @@
 """Finite-horizon value iteration on a grid: one dynamic programme for every task of two or three dimensions.
 
-V_t(x), the largest return that can still be had from state x with t steps taken, is kept at the nodes of a
-grid and interpolated linearly between them. One step does not depend on t, so where each action leads from
-each node, and what it pays, is worked out once (`transitions`); going backwards in time is then looking up:
+V_t(x), the largest return that is still attainable from state x after t steps, is stored at the nodes of a
+grid and interpolated linearly between them. A step does not depend on t, so the successor and the reward of
+each action at each node are computed once (`transitions`); the backward recursion then only looks them up:
 
     V_t(x) = max over a of  reward(x, a) + E V_{t+1}(kicked(next(x, a))),    V_T = 0.
 
-All V_t are kept in a file, so that a policy can be read off; a run that was killed goes on from it.
+All V_t are stored in a file, from which a policy is read; a run that was killed resumes from it.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from lag_envs.store import write
 Array = NDArray[np.float64]
 #: (points (n, d), actions (n,)) to (coordinates (n, d), rewards (n,), ended (n,)).
 Step = Callable[[Array, Array], tuple[Array, Array, NDArray[np.bool_]]]
-#: points (n, d) to (coordinates (m, n, d), weights (m,)): where m outcomes of a random kick lead.
+#: points (n, d) to (coordinates (m, n, d), weights (m,)): the m outcomes of a random kick.
 Kick = Callable[[Array], tuple[Array, Array]]
 
 VALUES, PROGRESS = "values.npy", "progress.json"
-#: Rows that are stepped together when the transitions are worked out: bounds the memory.
+#: Rows that are stepped together when the transitions are computed: bounds the memory.
 CHUNK = 1_000_000
 #: Seconds between two records of the progress.
 RECORD = 1.0
 
 
 class CacheError(Exception):
-    """A cached value function that cannot be used; the text says what to do."""
+    """A cached value function cannot be used; the message says what to do."""
 
 
 # --- the grid -----------------------------------------------------------------------------------------------
@@ -56,14 +56,14 @@ class Grid:
     axes : tuple of ndarray
         The nodes of 2 or 3 axes, growing; their distances may differ.
     periods : tuple of float or None
-        For each axis the period, or None. A periodic axis has its first node again at its end, a period on.
+        For each axis the period, or None. A periodic axis ends with its first node, one period later.
     """
 
     axes: tuple[Array, ...]
     periods: tuple[float | None, ...]
 
     def __post_init__(self) -> None:
-        """Refuse what the compiled functions do not take."""
+        """Refuse grids that the compiled functions do not support."""
         if len(self.axes) not in (2, 3) or len(self.periods) != len(self.axes):
             raise ValueError(
                 f"a grid has 2 or 3 axes and a period (or None) for each, got {len(self.axes)} axes and "
@@ -95,7 +95,7 @@ class Grid:
     def locate(self, coordinates: Array) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Return the flat index of the cell's first node, (n,), and the place in the cell, (n, d), 0 to 1.
 
-        What lies outside is moved to the grid's edge.
+        Points outside are moved to the grid's edge.
         """
         cells, places = np.zeros(len(coordinates), np.int32), np.empty(coordinates.shape, np.float32)
         for j, (axis, period) in enumerate(zip(self.axes, self.periods, strict=True)):
@@ -116,15 +116,15 @@ class Grid:
 
     @property
     def strides(self) -> NDArray[np.int64]:
-        """How far neighbours along each axis lie from one another in the flat array."""
+        """Strides: the distance of neighbours along each axis in the flat array."""
         return np.array([int(np.prod(self.shape[j + 1 :])) for j in range(len(self.shape))])
 
 
 def stretched(low: float, centre: float, high: float, cells: int, scale: float) -> Array:
-    """Return nodes that lie densely around a centre: within `scale` of it evenly, farther out ever wider.
+    """Return nodes that are dense around a centre: evenly spaced within `scale`, ever wider farther out.
 
-    Half of the cells lie on either side of the centre, which is a node; all on one side where the centre is
-    an end. Twice as many cells halve each.
+    Half of the cells lie on either side of the centre, which is a node; if the centre is an end, all cells
+    lie on one side. Doubling the number of cells halves each.
     """
     half = cells // 2
     numbers = (0, cells) if centre <= low else (cells, 0) if centre >= high else (half, cells - half)
@@ -185,12 +185,12 @@ def carried(x: Any, nodes: Any, own: Any, others: Any) -> Any:
 
 @dataclass(frozen=True)
 class Transitions:
-    """Where every action leads from every node, and what it pays.
+    """The successor and the reward of every action at every node.
 
     Parameters
     ----------
     cells : ndarray of int32, shape (nodes, actions)
-        Cell of the next state; -1 where the episode has ended.
+        Cell of the next state; -1 if the episode has ended.
     places : ndarray of float32, shape (nodes, actions, d)
         Place in that cell.
     rewards : ndarray of float32, shape (nodes, actions)
@@ -203,7 +203,7 @@ class Transitions:
 
 
 def transitions(grid: Grid, actions: Array, step: Step) -> Transitions:
-    """Work out all transitions."""
+    """Compute all transitions."""
     n, m, d = grid.size, len(actions), len(grid.axes)
     result = Transitions(
         np.empty((n, m), np.int32), np.empty((n, m, d), np.float32), np.empty((n, m), np.float32)
@@ -265,7 +265,7 @@ class ValueIteration:
     kick : callable, optional
         The random part of a step, see `Kick`.
     parameters : dict, optional
-        What the step depends on, in JSON types: names the cache, and is kept there to be read.
+        Everything the step depends on, in JSON types: it names the cache, and is stored there for reference.
     """
 
     def __init__(
@@ -294,7 +294,7 @@ class ValueIteration:
 
     @property
     def name(self) -> str:
-        """Name of the cache's folder: it changes with everything that the result depends on."""
+        """Name of the cache's folder: it changes with everything that affects the result."""
         text = json.dumps(self.parameters, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -304,7 +304,7 @@ class ValueIteration:
         return 4 * (self.steps + 1) * self.grid.size
 
     def _fingerprint(self) -> str:
-        """Return a hash of nodes, actions, and what the step does at some of them, so of its code too."""
+        """Return a hash of nodes, actions and sampled steps, and so of the step's code too."""
         rng = np.random.default_rng(0)
         points = np.stack([rng.uniform(axis[0], axis[-1], 200) for axis in self.grid.axes], axis=1)
         results: list[Any] = list(self.step(points, rng.choice(self.actions, 200)))
@@ -324,13 +324,13 @@ class ValueIteration:
         Parameters
         ----------
         folder : Path, optional
-            Parent of the cache's folder; without it nothing is kept on disk.
+            Parent of the cache's folder; without it nothing is stored on disk.
         new : bool
-            Whether to forget what the cache holds.
+            Whether to discard the cache.
         label : str
-            What the progress bar is called.
+            Label of the progress bar.
         quiet : bool
-            Whether to show none.
+            Whether to hide the progress bar.
         """
         cache = None if folder is None else Cache(folder / self.name, self, new)
         values = np.zeros((self.steps + 1, self.grid.size), np.float32) if cache is None else cache.values
@@ -394,10 +394,10 @@ class ValueIteration:
 
 
 class Cache:
-    """The values in a folder: ``values.npy`` as an array in a file, ``progress.json`` for how far they go.
+    """The values in a folder: ``values.npy``, a memory-mapped array, and ``progress.json``, its progress.
 
-    The progress is replaced whole, and only after the values that it speaks of are written: after a kill at
-    any moment the next run goes on from there, with the same result.
+    The progress file is replaced as a whole, and only after its values are written: after a kill at any
+    moment the next run resumes from there, with the same result.
 
     Raises
     ------
@@ -421,7 +421,7 @@ class Cache:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.values = np.lib.format.open_memmap(file, mode="w+", dtype=np.float32, shape=shape)
-            if hasattr(os, "posix_fallocate"):  # else a full disk would show as a crash, in the midst of it
+            if hasattr(os, "posix_fallocate"):  # otherwise a full disk would crash the run midway
                 with file.open("r+b") as opened:
                     os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
         except OSError as error:
@@ -441,7 +441,7 @@ class Cache:
                 raise ValueError("it belongs to another problem")
             if not isinstance(self.done, int) or not 0 <= self.done < shape[0]:
                 raise ValueError(f"done={self.done!r} is not a step of the episode")
-            # Opened to be written, a file that is too short would be made longer.
+            # Opening for writing would extend a file that is too short.
             kept = np.lib.format.open_memmap(self.folder / VALUES, mode="r")
             if kept.shape != shape or kept.dtype != np.float32:
                 raise ValueError(f"{VALUES} holds {kept.dtype} of shape {kept.shape}")
@@ -455,7 +455,7 @@ class Cache:
             ) from error
 
     def record(self, done: int, seconds: float) -> None:
-        """Note that V_t is known from t = done on."""
+        """Record that V_t is known from t = done on."""
         self.values.flush()
         self.done, self.seconds = done, seconds
         progress = {

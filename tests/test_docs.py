@@ -285,8 +285,8 @@ def test_measured_error(env_id):
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
-    assert f"is below {limit} of the state's size in nine environments of ten" in plain(readme())
-    assert f"errs by less than {limit} of the largest that each entry" in plain(numerics())
+    assert f"is below {limit} of the state's size in nine of ten environments" in plain(readme())
+    assert f"error is less than {limit} of the largest value that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
     episode = play(env, random_actions(env, 3))

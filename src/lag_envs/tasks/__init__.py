@@ -1,6 +1,6 @@
-"""Tasks on the scenes: start, control, reward, ending, observation, and all else that people decide.
+"""Tasks on the scenes: start, control, reward, ending, observation, and every other design decision.
 
-``TASKS`` has the class of every environment by id. To add one, write its task in a file of this folder.
+``TASKS`` maps ids to the classes of the environments. To add one, write its task in a file of this folder.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lag_envs.tasks.measured import known
 
 
 class Tasks(UserDict[str, Any]):
-    """Task classes by id; given as "module:Class", one is imported when it is asked for."""
+    """Task classes by id; one given as "module:Class" is imported on first access."""
 
     def __getitem__(self, env_id: str) -> type[Any]:
         """Return the class."""
@@ -23,7 +23,7 @@ class Tasks(UserDict[str, Any]):
 
 
 def __getattr__(name: str) -> Any:
-    """Return `Task`, from which a task of one's own derives; it is loaded when it is asked for."""
+    """Return `Task`, the base class of every task; it is loaded on first access."""
     if name == "Task":
         from lag_envs.tasks.base import Task
 
@@ -32,7 +32,7 @@ def __getattr__(name: str) -> Any:
 
 
 def load_task(place: str | type[Any]) -> type[Any]:
-    """Return the task class at "module:Class", or raise a ValueError; a class as it is."""
+    """Return the task class at "module:Class", or raise a ValueError; a class is returned unchanged."""
     if isinstance(place, type):
         return place
     try:
@@ -42,7 +42,7 @@ def load_task(place: str | type[Any]) -> type[Any]:
 
 
 def resolve(place: str) -> Any:
-    """Return what stands at "module:name"."""
+    """Return the object at "module:name"."""
     module, _, name = place.partition(":")
     found: Any = import_module(module)
     for part in name.split("."):
@@ -51,9 +51,9 @@ def resolve(place: str) -> Any:
 
 
 def find(folder: Path, package: str) -> dict[str, str]:
-    """Return where the tasks in a package's folder stand: classes with a line ``id = "..."``.
+    """Return the places of the tasks in a package's folder: classes with a line ``id = "..."``.
 
-    The files are read and not imported: that would add half to the time of ``import lag_envs``.
+    The files are read, not imported: importing them would make ``import lag_envs`` half as slow again.
     """
     lines = re.compile(r'\nclass (\w+)|\n    id = "([\w-]+)"')
     places = {}
@@ -63,7 +63,7 @@ def find(folder: Path, package: str) -> dict[str, str]:
             kind = name or kind
             if env_id:
                 places[env_id] = f"{package}{file.stem}:{kind}"
-    # Those that were measured first come first.
+    # In the order in which they were measured.
     order = {env_id: i for i, env_id in enumerate(known())}
     return dict(sorted(places.items(), key=lambda item: order.get(item[0], len(order))))
 

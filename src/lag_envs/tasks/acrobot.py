@@ -23,21 +23,21 @@ _ANGLES = {
 
 
 class AcrobotExact(Task):
-    """Lift the tip of two links above a line by the elbow's motor: Gymnasium's Acrobot-v1, stepped exactly.
+    """Lift the tip of two links above a line with a motor at the elbow: Gymnasium's Acrobot-v1, exact.
 
     ## Description
 
-    Two links hang from a pivot, with a motor at the elbow only. Swing them so that the tip gets one link's
+    Two links hang from a pivot, with a motor only at the elbow. Swing them so that the tip gets one link's
     length above the pivot, as soon as possible. Spaces, rewards, starts and endings are those of Gymnasium's
-    `Acrobot-v1`, so a policy that was trained there runs here as it is, and the other way round.
+    `Acrobot-v1`, so a policy trained there runs here unchanged, and vice versa.
 
-    Two things differ. Gymnasium takes one Runge-Kutta step of 0.2 s at a time, by which the energy of the
-    undriven links drifts by joules within an episode. Here the motion under the held torque is exact. And
-    Gymnasium clips the speeds at 4π and 9π rad/s, which takes energy away without a cause. Here they are
-    free, and only what is *observed* of them is clipped.
+    Two things differ. Gymnasium takes one Runge-Kutta step of 0.2 s at a time, so the energy of the undriven
+    links drifts by joules within an episode. Here the motion under the held torque is exact. And Gymnasium
+    clips the speeds at 4π and 9π rad/s, which removes energy without a physical cause. Here the speeds are
+    free, and only their *observations* are clipped.
 
-    What is kept, though no links of 1 kg and 1 m can have it, is the inertia of 1 kg m² about each centre of
-    mass: no mass distribution within a link gives more than a quarter of that.
+    The inertia of 1 kg m² about each centre of mass is kept, although no link of 1 kg and 1 m can have it: no
+    mass distribution within a link gives more than a quarter of that.
 
     ## Action Space
 
@@ -49,7 +49,7 @@ class AcrobotExact(Task):
 
     ## Rewards
 
-    Each step pays -1, the one that reaches the goal 0. With another `dt` rewards are scaled by dt/0.2.
+    Each step pays -1; the step that reaches the goal pays 0. With another `dt` rewards are scaled by dt/0.2.
 
     ## Starting State
 
@@ -61,12 +61,12 @@ class AcrobotExact(Task):
 
     ## Arguments
 
-    Gymnasium's parameters, which its class has as constants, are keywords here. By default `damping_2` and
-    `dry_friction_2` follow the shoulder's.
+    The parameters, constants of the class in Gymnasium, are keywords here. By default `damping_2` and
+    `dry_friction_2` equal the shoulder's.
 
     ## Equations
 
-    These are those of Sutton and Barto's book, Gymnasium's choice (`book_or_nips = "book"`).
+    They are those of Sutton and Barto's book, as in Gymnasium (`book_or_nips = "book"`).
 
     ## Signs and Units
 
@@ -74,8 +74,8 @@ class AcrobotExact(Task):
 
     ## Numerical Accuracy
 
-    Two ways of stepping one equation part company after a while, so the episodes are not the same step by
-    step: the returns of a policy are.
+    Two integrators of the same equation diverge after a while, so episodes do not agree step by step. The
+    returns of a policy do agree.
 
     ## Known Returns
 
@@ -122,8 +122,8 @@ class AcrobotExact(Task):
     )
     difficulty = "The elbow's torque is far too weak to lift the links, so they have to be swung."
     note = (
-        "The switch takes the torque's sign from a sum of what is observed, with weights found by random "
-        "search. It never plans ahead."
+        "The switch takes the torque's sign from a weighted sum of observations, with weights found by "
+        "random search. It never plans ahead."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -154,7 +154,7 @@ class AcrobotExact(Task):
         return {"line": [Line([(-wide, 0.0), (wide, 0.0)], "target")], **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the line is."""
+        """Add the place of the line."""
         return {**super().indicators(now, xp), "line": (0.0, self.scene.length_1, 0.0)}
 
 
@@ -163,14 +163,15 @@ class AcrobotReal(Task):
 
     ## Description
 
-    The double pendulum of the RealAIGym project, as identified: two links with quasi-direct-drive motors,
-    friction in both joints, and here only the elbow driven. Swing both links up and keep them upright.
+    The double pendulum of the RealAIGym project, with its identified parameters: two links with
+    quasi-direct-drive motors, friction in both joints, and here only the elbow driven. Swing both links up
+    and keep them upright.
 
     Parameters, torque limit, control interval, length of an episode and criterion of success are those of the
-    project's published leaderboards [1]_: `design_C.1`, `model_1.0`, 6 N m, 0.002 s and 10 s. Its simulations
-    leave friction and rotors out, its machine has them; so has this one. The driven joint's friction is that
-    which was identified. The idle joint's is 0, for on the machine the idle motor compensates it: it may give
-    0.5 N m for that, and friction takes half as much at most.
+    project's published leaderboards [1]_: `design_C.1`, `model_1.0`, 6 N m, 0.002 s and 10 s. The project's
+    simulations omit friction and rotors, but its machine has them, and so has this environment. The driven
+    joint has the identified friction. The idle joint has none, because on the machine the idle motor
+    compensates it: it may use 0.5 N m for that, and friction takes at most half as much.
 
     .. [1] F. Wiebe et al., "Open Source Dual-Purpose Acrobot and Pendubot Platform", IEEE Robotics &
        Automation Magazine 31 (2024); github.com/dfki-ric-underactuated-lab/double_pendulum, folders
@@ -188,11 +189,11 @@ class AcrobotReal(Task):
 
     Each step pays 0.02 h⁴ (1 - 0.1 a²), so that a second pays 10 at most. The tip's height h is 0 hanging and
     1 upright, taken at the step's end; a is the action. The project's own score, which weighs several norms
-    of a whole trajectory, is no sum over steps. With another `dt` rewards are scaled by dt/0.002.
+    of a whole trajectory, is not a sum over steps. With another `dt` rewards are scaled by dt/0.002.
 
     ## Starting State
 
-    The links hang, nearly at rest; the project's begin at rest.
+    The links hang, nearly at rest; in the project they start exactly at rest.
 
     ## Episode End
 
@@ -200,13 +201,13 @@ class AcrobotReal(Task):
 
     ## Arguments
 
-    Inertias are about the centres of mass, those of the project's files about the joints. The shoulder's
+    Inertias are about the centres of mass; in the project's files they are about the joints. The shoulder's
     identified friction is `damping=0.001` and `dry_friction=0.16`, the elbow's `damping_2=0.001` and
-    `dry_friction_2=0.12`; with `rotor_inertia=0` and without any friction it is the project's simulation.
+    `dry_friction_2=0.12`. With `rotor_inertia=0` and no friction, this is the project's simulation.
 
     ## Equations
 
-    Dry friction f atan(100 v) is the project's too.
+    The dry friction f atan(100 v) is also the project's.
 
     ## Signs and Units
 
@@ -214,7 +215,7 @@ class AcrobotReal(Task):
 
     ## Numerical Accuracy
 
-    The friction's step is narrow: where a joint's speed passes 0, steps are divided.
+    Dry friction changes steeply around zero speed: where a joint's speed passes 0, steps are divided.
 
     ## Known Returns
 
@@ -232,7 +233,7 @@ class AcrobotReal(Task):
         "theta_2_dot/20": ("rad/s", "that of the second against the first, divided by 20"),
     }
     scene: Any = Acrobot
-    #: Inertias about the centres of mass; the source has 0.031887199591513114 and 0.05086984812807257 kg m²
+    #: Inertias about the centres of mass; the source gives 0.031887199591513114 and 0.05086984812807257 kg m²
     #: about the joints.
     defaults = {
         "mass_1": 0.5234602302310271,
@@ -301,14 +302,13 @@ class AcrobotReal(Task):
         },
     )
     difficulty = (
-        "One motor for two joints, and friction that eats what is pumped in; the upright rest is unstable, "
-        "and 500 decisions a second leave little time for each."
+        "There is one motor for two joints, and friction dissipates the energy that is pumped in. The "
+        "upright equilibrium is unstable, and 500 decisions a second leave little time for each."
     )
     note = (
-        "The LQR is that of the project's leaderboard. It holds the links where it finds them upright; "
-        "hanging links it leaves alone. The plan was found on the exact model with its friction; its "
-        "feedback is "
-        "that of a model without dry friction."
+        "The LQR is that of the project's leaderboard. It only holds links that are upright already; it "
+        "does not swing up hanging ones. The plan was found on the exact model with friction; its feedback "
+        "comes from a model without dry friction."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -345,12 +345,12 @@ class AcrobotReal(Task):
         return {**upright, **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the upright links are."""
+        """Add the places of the upright links."""
         added = {"upright first": (0.0, 0.0, math.pi), "upright second": (0.0, self.scene.length_1, math.pi)}
         return {**super().indicators(now, xp), **added}
 
 
-class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of both)
+class PendubotReal(AcrobotReal):  # noqa: D101 (AcrobotReal's docstring, adapted)
     __doc__ = (
         (AcrobotReal.__doc__ or "")
         .replace("by a motor at the elbow", "by a motor at the shoulder")

@@ -1,4 +1,4 @@
-"""Angles as tasks observe them: by cosine and sine, which know no full turns."""
+"""Angles as tasks observe them: by cosine and sine, which are the same after a full turn."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ def circle(state: Any, *names: str, xp: Any) -> dict[str, Any]:
 
 
 def bounds_of_circle(quantities: Mapping[str, Any]) -> dict[str, float]:
-    """Return the bound of each cosine and sine among what is observed."""
+    """Return the bound of each cosine and sine in the observation."""
     return {name: 1.0 for name in quantities if name.startswith(("cos(", "sin("))}

@@ -14,13 +14,13 @@ from lag_envs.tasks.record import Controller, Examples, Goal
 
 
 class Reach(Task):
-    """Bring an arm's hand to a point by torques in shoulder and elbow, and keep it there.
+    """Bring an arm's hand to a point with torques at shoulder and elbow, and keep it there.
 
     ## Description
 
     An arm of two links hangs in a vertical plane. A point in front of it is drawn for each episode. Bring the
-    hand there, soon, and hold it still against gravity. The motors are weak: the shoulder's cannot hold the
-    arm stretched out level, so of the two postures that reach a point often only one can be kept.
+    hand there quickly, and hold it still against gravity. The motors are weak: the shoulder's cannot hold the
+    arm stretched out level, so often only one of the two postures that reach a point can be held.
 
     ## Action Space
 
@@ -33,7 +33,7 @@ class Reach(Task):
     ## Rewards
 
     Each step pays exp(-d/0.1)(1 - 0.05 (a₁² + a₂²)), with the hand's distance d from the point in metres at
-    the step's end and the actions a. To pass through the point pays next to nothing: what pays is to be
+    the step's end and the actions a. Passing through the point pays next to nothing: the hand has to stay
     there. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
@@ -50,8 +50,8 @@ class Reach(Task):
 
     ## Signs and Units
 
-    SI units. θ₁ is measured from the level, counter-clockwise, so -π/2 hangs; θ₂ = 0 is stretched. Neither is
-    wrapped. The shoulder is the origin, x to the right and y upward.
+    SI units. θ₁ is measured from the horizontal, counter-clockwise, so the arm hangs at -π/2; θ₂ = 0 is
+    stretched. Neither is wrapped. The shoulder is the origin; x points right and y up.
 
     ## Known Returns
 
@@ -110,13 +110,12 @@ class Reach(Task):
         },
     )
     difficulty = (
-        "Torques are scarce, the links act on each other, and a posture that cannot be held must be left "
-        "alone."
+        "Torques are limited, the links act on each other, and a posture that cannot be held must be avoided."
     )
     note = (
-        "Springs that pull towards the joint angles of the posture hang short of them, for gravity pulls "
-        "too. The computed torque takes gravity and links' coupling out, and picks the posture that costs "
-        "less to hold."
+        "Springs that pull towards the joint angles of the posture sag below them, because gravity pulls "
+        "too. The computed torque compensates gravity and the links' coupling, and picks the posture that "
+        "costs less to hold."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -154,5 +153,5 @@ class Reach(Task):
         return {"point": [Circle((0.0, 0.0), size, "target")], **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the point is."""
+        """Add the place of the point."""
         return {**super().indicators(now, xp), "point": (now.target[0], now.target[1], 0.0)}

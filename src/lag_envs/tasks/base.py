@@ -33,10 +33,10 @@ from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, Val
 if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
 
-#: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
+#: Largest speed of a given start, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
-#: Angle [rad] through which `Task.fastest` may turn in a step. It then needs far fewer substeps than are
-#: allowed, also after many steps have added to the speed.
+#: Largest angle [rad] turned at the speed `Task.fastest` in a step. A step then needs far fewer substeps than
+#: are allowed, even after many steps have added to the speed.
 LONGEST_TURN = 5000.0
 #: Names of the formulas of a task.
 FORMULAS = ("guard", "observe", "reward", "last_reward", "terminated", "kick")
@@ -46,10 +46,10 @@ _UNBOUNDED = float(np.finfo(np.float32).max)
 class Task:
     """A task on a scene.
 
-    A subclass defines attributes and methods of those below, at least `scene`, `interval`, `steps`, `action`,
-    `observe` and `reward`. Formulas use names: ``before`` and ``after`` are the state at both ends of the
-    step, with the names of ``scene.state_names``; ``control`` has the controls that were applied, ``target``
-    the targets. Formulas may use ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, functions
+    A subclass defines some of the attributes and methods below, at least `scene`, `interval`, `steps`,
+    `action`, `observe` and `reward`. Formulas use names: ``before`` and ``after`` are the state at both ends
+    of the step, with the names of ``scene.state_names``; ``control`` has the applied controls, ``target`` the
+    targets. Formulas may use ``+ - * /``, integer powers, comparisons joined by ``|`` and ``&``, functions
     of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum), and the scene's
     parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
 
@@ -58,7 +58,7 @@ class Task:
     id : str
         Name under which `lag_envs.register` registers it.
     scene : type
-        The scene; an instance has the scene itself here.
+        The scene's class; on an instance of the task, the scene itself.
     defaults : mapping
         Parameters of the scene whose defaults this task changes.
     interval : float
@@ -76,31 +76,31 @@ class Task:
     scaled : bool
         Whether rewards are scaled by dt/interval for another `dt`.
     largest_action : float
-        The action that asks for the largest control: the space is the box of ± as much. Only where others
-        have fixed it, it is not 1.
+        The action for the largest control: the action space is ± this value. It differs from 1 only in tasks
+        that copy another environment's space.
     peer : str
         The environment of Gymnasium that has the same spaces, rewards and endings.
     unbounded : float
-        What the space has as bound of an observation that has none: the largest float32, or infinity.
+        Bound in the space for unbounded observations: the largest float32, or infinity.
     order : int, optional
         Order of the general series, 6 to 24; by default it follows from `dt`. Slow motions are stepped
         faster with a lower order, fast ones with a higher one. Steps are certified with any order.
-        ``lag-envs order FILE`` measures which is best.
+        ``lag-envs order FILE`` measures the best.
     usable : mapping
         Ranges of parameters in which the task can be used, if they differ from those that the scene declares.
         For any combination of values in these ranges that `fastest` does not forbid, every accepted start and
-        action gives finite observations within their space, and every step is taken.
+        action gives finite observations within their space, and no step is refused.
     controllers : mapping
         A `record.Controller` for each of its controllers, by name. Every task also has "zero" and "random".
     reference : str
         A quick controller among them, used as a control variate where episodes differ much.
     imperfections : mapping
         Keywords of imperfect sensors and actuators and of hidden parameters (`lag_envs.tasks.imperfections`)
-        that this task's environments have on. An instance has them checked here, or None. Formulas, and so
+        that are on in this task's environments. On an instance: the checked values, or None. Formulas, and so
         `envs.model.Model` and controllers, are those of the task without them.
     hyperparameters : mapping
         For a learner, one of `lag_envs.hyperparams.learners`, or for "off_policy", which stands for several:
-        what differs from `lag_envs.hyperparams.DEFAULTS`.
+        the differences from `lag_envs.hyperparams.DEFAULTS`.
     goal : record.Goal, optional
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
@@ -110,13 +110,13 @@ class Task:
     optimum : record.Optimum, optional
         The largest return from given starts, where it is known.
     open : record.Open, optional
-        That nobody has solved it, and what was tried.
+        Marks a task that nobody has solved, with the attempts.
     examples : record.Examples
         Cases for tests and pictures.
     difficulty : str
-        Why it is hard, in a sentence or two, for its page.
+        Why the task is hard, in a sentence or two, for its page.
     note : str
-        A text about its agents for docs/agents.md, without numbers: the tables have those.
+        A text about its agents for docs/agents.md, without numbers, which are in the tables.
     quantities : mapping
         For entries of the observation (unit, meaning), as the environment's page has them.
 
@@ -243,7 +243,7 @@ class Task:
         return False
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
-        """Return what a random kick adds to entries of the state; draws lie in [0, 1)."""
+        """Return the change of the state's entries by a random kick; draws lie in [0, 1)."""
         return {}
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
@@ -255,19 +255,19 @@ class Task:
         return {}
 
     def check(self) -> None:
-        """Raise ValueError where the parameters do not fit the task."""
+        """Raise ValueError if the parameters do not fit the task."""
 
     def check_start(self, state: Any) -> None:
-        """Raise ValueError for a start that the task cannot have; `state` goes by name or by index."""
+        """Raise ValueError for an impossible start; `state` is accessed by name or by index."""
 
     @property
     def fastest(self) -> float:
-        """The speed that field and drive can give to a swing [rad/s]; 0 if nothing swings."""
+        """The largest speed that field and drive can give to a swing [rad/s]; 0 if nothing swings."""
         return 0.0
 
     @property
     def edges(self) -> Sequence[Sequence[float]]:
-        """States at the edge of what the task reaches, in all that drives the motion but angle and rate."""
+        """Extreme states of the task, in every entry that affects the motion except angle and rate."""
         return [self.centre]
 
     # --- what follows --------------------------------------------------------------------------------------
@@ -280,7 +280,7 @@ class Task:
         return {f.name: f.metadata["usable"] for f in fields if "usable" in f.metadata} | dict(cls.usable)
 
     def check_usable(self) -> None:
-        """Raise ValueError where a parameter is outside the range in which the task can be used."""
+        """Raise ValueError if a parameter is outside the range in which the task can be used."""
         for name, (low, high) in self.usable_ranges().items():
             value = getattr(self.scene, name)
             if value is not None and not math.isinf(value) and not low <= value <= high:
@@ -330,13 +330,13 @@ class Task:
 
     @property
     def limit_control(self) -> Any:
-        """Largest size of the control; an array where there are several."""
+        """Largest size of the control; an array if there are several."""
         largest = [max(abs(a.low), abs(a.high)) for a in self.formulas.acting]
         return largest[0] if len(largest) == 1 else np.array(largest)
 
     @property
     def rest_action(self) -> Any:
-        """The action without control, or the nearest to it: that of a person who does nothing."""
+        """The action for zero control, or the nearest to it; applied if nobody presses a key."""
         return self.formulas.rest_action
 
     @property
@@ -347,7 +347,7 @@ class Task:
     def certified_speed(self) -> float | None:
         """Return the rate of the angle up to which one series per step is certified, whatever the control.
 
-        It is below 0 where one series is never enough, and None where the scene is no driven pendulum. See
+        It is below 0 if one series is never enough, and None if the scene is not a driven pendulum. See
         `NormalForm.certified_speed`.
         """
         form, k = self.scene._form, self.scene._constants()
@@ -357,7 +357,7 @@ class Task:
         return min((speed for speed in found if speed is not None), default=None)
 
     def chance(self, per_interval: float) -> float:
-        """Return a step's chance of what has a chance per interval: a second has as many for any `dt`."""
+        """Return an event's chance per step from that per interval: its rate is the same for any `dt`."""
         if self._recording is not None:
             return self._recording.chance(per_interval)
         if self.dt == self.interval:
@@ -372,12 +372,12 @@ class Task:
 
     @cached_property
     def formulas(self) -> TaskFormulas:
-        """What compiled functions are made of."""
+        """The formulas from which the compiled functions are made."""
         return TaskFormulas(self)
 
     @cached_property
     def drawn(self) -> Drawn | None:
-        """The tasks among which each episode's is drawn; None where no parameter is."""
+        """The tasks among which each episode's is drawn; None if no parameter is drawn."""
         return Drawn(self) if self.imperfections and self.imperfections.drawn else None
 
     def varied(self, **parameters: float) -> Task:
@@ -396,19 +396,19 @@ class Task:
 
     @property
     def variant(self) -> tuple:
-        """What decides the code besides the class: the environments of a batch must agree in it."""
+        """What determines the code besides the class: the environments of a batch must agree in it."""
         scene, form = self.scene, self.scene._form
         order = form.order(self.dt) if form else 0
         return *scene._structure[1:3], scene.mechanics.zeros, order, self.fixed_target is None
 
     @property
     def target_range(self) -> Any:
-        """Half width of the random target, a tuple where there are several; None for a task without any."""
+        """Half width of the random target, a tuple if there are several; None for a task without targets."""
         half = tuple(t.half for t in self.formulas.target_boxes)
         return half[0] if len(half) == 1 else half or None
 
     def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
-        """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
+        """Return a given start as float64 array, or raise a ValueError if the task cannot start there."""
         array = check_state(self.scene, state)
         for entry, value in zip(self.scene._layout.state, array, strict=True):
             if entry.kind != "place" and abs(value) > FASTEST_START:
@@ -422,7 +422,7 @@ class Task:
         return array
 
     def check_target(self, target: Any) -> Any:
-        """Return the target as float, or an array where there are several; or raise a ValueError."""
+        """Return the target as float, or as array if there are several; or raise a ValueError."""
         names = [t.name for t in self.formulas.target_boxes]
         if not names:
             raise ValueError(f"this task has no target, got target={target!r}")
@@ -459,11 +459,11 @@ class Task:
     # --- the picture ---------------------------------------------------------------------------------------
 
     def bodies(self) -> Bodies:
-        """Return shapes by frame, from back to front: the scene's, and what matters to the task."""
+        """Return shapes by frame, from back to front: the scene's, and those of the task."""
         return dict(self.scene.bodies())
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where frames are that show more than bodies: see `Scene.indicators`."""
+        """Return the places of the frames that show more than bodies: see `Scene.indicators`."""
         return dict(self.scene.indicators(now, xp))
 
     def window(self) -> Window:
@@ -471,7 +471,7 @@ class Task:
         return self.scene.window()
 
     def shapes(self, now: Frame) -> list[Shape]:
-        """Return what is to be seen at a moment, from back to front."""
+        """Return the visible shapes at a moment, from back to front."""
         return picture.Picture(self).placed(now)
 
     def wanted(self, actions: ArrayLike) -> NDArray[np.float64]:
@@ -493,14 +493,14 @@ class Task:
         ]
 
     def control_readings(self, now: Frame) -> list[Reading]:
-        """Return what the read-out tells of the controls."""
+        """Return the read-out's entries for the controls."""
         names = zip(
             self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True
         )
         return [Reading(name, float(value), unit, "action") for name, value, unit in names]
 
     def readings(self, now: Frame) -> list[Reading]:
-        """Return what the read-out tells besides state and controls: the targets."""
+        """Return the read-out's entries besides state and controls: the targets."""
         given: Any = [] if now.target is None else np.atleast_1d(now.target)
         return [
             Reading(t.name, float(value), t.unit, "target")
@@ -510,7 +510,7 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class TargetBox:
-    """Where a random target lies."""
+    """The range of a random target."""
 
     name: str
     unit: str
@@ -529,7 +529,7 @@ class Acting:
 
 
 class _Recording(NamedTuple):
-    """What a task sees of the step while its formulas are recorded."""
+    """The parts of a step that a task can access while its formulas are recorded."""
 
     k: Any
     form: NormalForm | None
@@ -537,14 +537,14 @@ class _Recording(NamedTuple):
 
 
 class Lifted:
-    """The namespace ``xp`` where cosine and sine of angles are already known.
+    """The namespace ``xp`` with known cosines and sines of angles.
 
     Parameters
     ----------
     xp : namespace
-        What computes all else.
+        Computes everything else.
     known : sequence of (angle, cosine, sine)
-        They are told by the identity of the angle, which is the very object that a formula gets.
+        An angle is recognised by identity: it is the very object that a formula gets.
     """
 
     def __init__(self, xp: Any, known: Sequence[tuple[Any, Any, Any]]) -> None:
@@ -576,9 +576,9 @@ _NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imp
 
 
 class TaskFormulas:
-    """The formulas of a task, as `lag_envs.envs.program` asks for them.
+    """The formulas of a task, as `lag_envs.envs.program` uses them.
 
-    States ``y`` and ``z`` are lifted where the scene has a normal form: cosine and sine of its angle follow.
+    If the scene has a normal form, states ``y`` and ``z`` are lifted: cosine and sine of its angle follow.
     """
 
     trace = ElementaryTrace
@@ -636,7 +636,7 @@ class TaskFormulas:
         return found | {"x": scene._limit(task.dt)}
 
     def starts_of(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the constants of the start that differ from 0, where the parameters are other numbers."""
+        """Return the nonzero constants of the start for other values of the parameters."""
         k = SimpleNamespace(**self.constants())
         vars(k).update({f"self_{name}": x for name, x in numbers.items()})
         with formula(self._task, "start"):
@@ -650,12 +650,12 @@ class TaskFormulas:
 
     @property
     def key(self) -> tuple:
-        """What decides the code: tasks of a class that agree in it differ in their numbers only."""
+        """What determines the code: tasks of a class that agree in it differ only in their numbers."""
         scene = self._task.scene
         kind = type(self._task)
         formulas = tuple(getattr(kind, name) for name in FORMULAS)
         plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
-        # Formulas may also name attributes of the task, which somebody may have set by hand.
+        # Formulas may also use attributes of the task that were set by hand.
         own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
         shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
         return scene.mechanics.key, self._task.variant, formulas, *plain, *own, *shared
@@ -674,7 +674,7 @@ class TaskFormulas:
     # --- formulas -------------------------------------------------------------------------------------------
 
     def _self(self, k: Any) -> Task:
-        """Return a task whose numbers are those that are recorded."""
+        """Return a copy of the task with recorded numbers."""
         task = copy.copy(self._task)
         for name in ("formulas", "drawn"):
             vars(task).pop(name, None)
@@ -710,14 +710,14 @@ class TaskFormulas:
             return getattr(self._self(k), name)(*arguments)
 
     def action(self, control: Any) -> Any:
-        """Return the action, unclipped, that asks for a control; for tasks with one."""
+        """Return the unclipped action that requests a control; for tasks with one control."""
         (acting,) = self.acting
         if acting.low == -acting.high:
             return self.largest * (control / acting.high)
         return self.largest * (2.0 * ((control - acting.low) / (acting.high - acting.low)) - 1.0)
 
     def shares(self, actions: Sequence) -> Sequence:
-        """Return actions as shares of the largest one; choices as they are."""
+        """Return actions as shares of the largest one; choices are unchanged."""
         if self.choices or self.largest == 1.0:
             return actions
         return [a * (1.0 / self.largest) for a in actions]
@@ -727,12 +727,12 @@ class TaskFormulas:
         return self.guarded(xp, self.wanted(xp, a), y, k)
 
     def wanted(self, xp: Any, a: Sequence) -> list:
-        """Return the controls that actions ask for, one for each that actions set."""
+        """Return the controls that actions request, one for each that actions set."""
         shares = zip(self.acting, self.shares(a), strict=True)
         return [_control(acting, share, xp) for acting, share in shares]
 
     def guarded(self, xp: Any, asked: Sequence, y: Sequence, k: Any) -> list:
-        """Return the controls that are applied where these are asked for."""
+        """Return the controls that are applied if these are requested."""
         wanted = dict.fromkeys(self._controls, 0.0)
         wanted |= {acting.control: u for acting, u in zip(self.acting, asked, strict=True)}
         if type(self._task).guard is Task.guard:
@@ -875,7 +875,7 @@ class TaskFormulas:
         for name in self.observation:
             bound = given.get(name, unbounded)
             pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
-            # Where an episode has no end no bound exists, and no speed times no end is no number.
+            # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
             low.append(float(pair[0]) if pair[0] > -_UNBOUNDED else -unbounded)
             high.append(float(pair[1]) if pair[1] < _UNBOUNDED else unbounded)
         return low, high

@@ -1,4 +1,4 @@
-"""Tasks with a pole on a cart: Gymnasium's, stepped exactly, with a continuous force, and from below."""
+"""Tasks with a pole on a cart: Gymnasium's, stepped exactly; with a continuous force; and the swing-up."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STATE = {
 
 
 class _OnTrack(Task):
-    """What the tasks have in common: a cart on a track that ends 2.4 m from its middle."""
+    """What the tasks share: a cart on a track that ends 2.4 m from its middle."""
 
     scene: Any = CartPole
     interval, steps = 0.02, 500
@@ -37,7 +37,7 @@ class _OnTrack(Task):
         return {"posts": posts, "upright": outlines(self.scene.bodies()["pole"]), **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where these are."""
+        """Add their places."""
         added = {"posts": (0.0, 0.0, 0.0), "upright": (now.q.x, 0.0, 0.0)}
         return {**super().indicators(now, xp), **added}
 
@@ -66,18 +66,18 @@ class _Numbers:
 
 
 class CartPoleExact(_OnTrack):
-    """Balance a pole on a cart by pushes to the left or right: Gymnasium's CartPole-v1, stepped exactly.
+    """Balance a pole on a cart with pushes to the left or right: Gymnasium's CartPole-v1, stepped exactly.
 
     ## Description
 
     A pole stands on a cart. Push the cart to either side so that the pole stays up. Spaces, rewards, starts
-    and endings are those of Gymnasium's `CartPole-v1`, so a policy that was trained there runs here as it is,
-    and the other way round.
+    and endings are those of Gymnasium's `CartPole-v1`, so a policy trained there runs here unchanged, and
+    vice versa.
 
-    One thing differs. Gymnasium steps by explicit Euler, so that a place does not depend on the push of its
-    own step, and energy grows out of nothing: within ten seconds to several times of what it was. Here the
-    motion under the held force is exact. Where the episode ends, what the space cannot hold is clipped in the
-    observation, not in the state.
+    One thing differs. Gymnasium steps by explicit Euler, so the position after a step does not depend on that
+    step's push, and energy grows out of nothing, within ten seconds to several times its initial value. Here
+    the motion under the held force is exact. At the end of an episode, values beyond the observation space
+    are clipped in the observation, not in the state.
 
     ## Action Space
 
@@ -85,12 +85,12 @@ class CartPoleExact(_OnTrack):
 
     ## Observation Space
 
-    Place and angle are bounded by twice the limits at which an episode ends. The speeds have no bound:
+    Position and angle are bounded by twice the limits at which an episode ends. The speeds have no bound:
     infinity, as in Gymnasium.
 
     ## Rewards
 
-    Each step pays 1, the last one too. With another `dt` rewards are scaled by dt/0.02.
+    Each step pays 1, including the last. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -106,7 +106,7 @@ class CartPoleExact(_OnTrack):
 
     ## Equations
 
-    Gymnasium's are the same, solved for the accelerations.
+    They are Gymnasium's, which are solved for the accelerations there.
 
     ## Signs and Units
 
@@ -114,12 +114,12 @@ class CartPoleExact(_OnTrack):
 
     ## Numerical Accuracy
 
-    Two ways of stepping one equation part company after a while, so the episodes are not the same step by
-    step: the returns of a policy are.
+    Two integrators of the same equation diverge after a while, so episodes do not agree step by step. The
+    returns of a policy do agree.
 
     ## Known Returns
 
-    No return exceeds 500, and the best policies get that.
+    No return exceeds 500, and the best policies reach it.
 
     ## Version History
 
@@ -159,7 +159,7 @@ class CartPoleExact(_OnTrack):
         },
     )
     difficulty = "The pole falls within a second unless it is caught, and there is no push of strength zero."
-    note = "An LQR whose sign is the push is as good as can be."
+    note = "The sign of an LQR's control gives the push; this reaches the largest return."
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return the state; place and angle clipped to the space."""
@@ -183,7 +183,7 @@ class CartPoleExact(_OnTrack):
 
 
 class CartPoleContinuous(_OnTrack):
-    """Balance a pole on a cart by a force of any strength, against kicks, near the middle of the track.
+    """Balance a pole on a cart with a continuous force, against kicks, near the middle of the track.
 
     ## Description
 
@@ -196,14 +196,14 @@ class CartPoleContinuous(_OnTrack):
 
     ## Observation Space
 
-    The state, each entry divided by about what it reaches. Inside the limits below place and angle lie in
+    The state, each entry divided by its typical range. Inside the limits below, position and angle lie in
     [-1, 1]; the last step may lead beyond, and the speeds have no bound.
 
     ## Rewards
 
     Each step pays (1 - (θ/0.21)²/2 - (x/2.4)²/2)(1 - 0.1 a²), taken at its end and before a kick, with the
-    action a; 0.21 rad are the 12 degrees below. Inside the limits that lies between 0 and 1, and the effort
-    is a factor, so that ending an episode never pays. With another `dt` rewards are scaled by dt/0.02.
+    action a; 0.21 rad are the 12 degrees below. Inside the limits the reward lies between 0 and 1, and the
+    effort is a factor, so that ending an episode never pays. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -274,10 +274,10 @@ class CartPoleContinuous(_OnTrack):
         },
     )
     difficulty = (
-        "To bring the cart to the middle it must first be pushed away from it, and each kick has to be met "
-        "with a pole that is never upright by itself."
+        "To move the cart to the middle, it must first be pushed away from it, and each kick hits a pole "
+        "that is never stable by itself."
     )
-    note = "The LQR's weights are of the size of the reward's; nobody tuned them further."
+    note = "The LQR's weights have the size of the reward's; nobody tuned them further."
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return the scaled state."""
@@ -321,7 +321,7 @@ class CartPoleSwingUp(_OnTrack):
 
     ## Observation Space
 
-    The speeds have no bound. Until the last step, the place lies in [-1, 1].
+    The speeds have no bound. Until the last step, the position lies in [-1, 1].
 
     ## Rewards
 
@@ -424,9 +424,9 @@ class CartPoleSwingUp(_OnTrack):
             "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
         },
     )
-    difficulty = "The pole must be pumped, caught, and the cart kept on its track meanwhile."
+    difficulty = "The pole must be pumped and caught, while the cart stays on its track."
     note = (
-        "Best is a plan, found on the exact model and followed by feedback. Energy shaping, which pumps "
+        "The best agent follows a plan, found on the exact model, with feedback. Energy shaping, which pumps "
         "with the cart's acceleration and hands over to an LQR, is nearly as good."
     )
 

@@ -16,7 +16,7 @@ from lag_envs.tasks.track import GuardedTrack, Support
 
 
 class _Chain(Support):
-    """What the tasks with chains have in common."""
+    """What the tasks with chains share."""
 
     scene: Any
     #: Chance of a kick per interval, and its largest size [rad/s].
@@ -24,16 +24,17 @@ class _Chain(Support):
 
     @property
     def angles(self) -> list[str]:
-        """Names of the angles, from the support on."""
+        """Names of the angles, starting at the support."""
         return list(self.scene.coordinates)
 
     def fastest_turn(self) -> float:
         r"""Return a bound on the rates of the angles [rad/s].
 
         Let W be kinetic plus potential energy in the support's frame, at least 0, and M the mass of all bars.
-        The frame's acceleration u adds the power -u Σ m x' ≤ U √(2 M W), and damping takes some, so √W
-        grows by U √(M/2) a second at most. A kick of the last bar's rate by k adds at most k √(J/2) to it, J
-        being the bar's moment of inertia about its joint. Each bar's turning is a part of W, I θ'²/2 ≤ W.
+        The frame's acceleration u adds the power -u Σ m x' ≤ U √(2 M W), and damping only reduces W, so √W
+        grows by at most U √(M/2) a second. A kick k of the last bar's rate adds at most k √(J/2) to √W, where
+        J is the bar's moment of inertia about its joint. Each bar's rotational energy is part of W, so
+        I θ'²/2 ≤ W.
         """
         scene = self.scene
         if scene.inertia == 0.0:
@@ -47,7 +48,7 @@ class _Chain(Support):
         return (math.sqrt(turning + fall) + pushed + kicked) * math.sqrt(2.0 / scene.inertia)
 
     def push(self, draws: Any, xp: Any) -> dict[str, Any]:
-        """Return a kick of the last bar's rate to either side, which comes now and then."""
+        """Return an occasional kick of the last bar's rate to either side."""
         size = self.largest_kick * (2.0 * draws[1] - 1.0)
         return {f"{self.angles[-1]}_dot": xp.where(draws[0] < self.chance(self.kick_chance), size, 0.0)}
 
@@ -58,7 +59,7 @@ class _Chain(Support):
         return {"upright": [Polygon(corners, "target")], **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where it is."""
+        """Add its place."""
         return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
 
 
@@ -74,19 +75,19 @@ class SwingUp(GuardedTrack, _Chain):
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    The support must be able to stop inside the track, braking at U, the largest acceleration. Where the
-    wanted acceleration would make that impossible, the nearest one that does not is applied.
-    `env.unwrapped.control` tells which.
+    The support must be able to stop inside the track, braking at U, the largest acceleration. If the
+    requested acceleration would make that impossible, the nearest one that allows it is applied.
+    `env.unwrapped.control` is the acceleration applied.
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted. They allow for a support that does nothing but add
-    energy, so an episode stays far within.
+    The bounds are proved for every accepted start. They assume that the support only adds energy, so real
+    episodes stay far within them.
 
     ## Rewards
 
     Each step pays h⁴ - 0.02 (u/U)². The height h of the chain's end is 0 hanging and 1 upright, taken at
-    the step's end; u is the acceleration that was applied. Because of the fourth power a chain that spins
+    the step's end; u is the acceleration that was applied. Because of the fourth power, a spinning chain
     earns little, and so does one whose upper bar stands while the lower one hangs. With another `dt` rewards
     are scaled by dt/0.02, so a second is always worth the same.
 
@@ -101,7 +102,7 @@ class SwingUp(GuardedTrack, _Chain):
 
     ## Arguments
 
-    `track=math.inf` is a track without an end; the observation then divides s by 0.5 m. `bars` changes the
+    `track=math.inf` is an endless track; the observation then divides s by 0.5 m. `bars` changes the
     state and the spaces.
 
     ## Equations
@@ -110,12 +111,14 @@ class SwingUp(GuardedTrack, _Chain):
 
     ## Signs and Units
 
-    SI units. Angles are against straight down, not against the bar above: θ = 0 hangs and θ = π stands. They
-    grow counter-clockwise and are not wrapped. s is positive to the right and 0 in the middle of the track.
+    SI units. Angles are measured from straight down, not from the bar above: a bar hangs at θ = 0 and stands
+    at θ = π. They grow counter-clockwise and are not wrapped. s is positive to the right and 0 in the middle
+    of the track.
 
     ## Numerical Accuracy
 
-    s and s' are exact to rounding. The last bar whips: a step is divided where one series would not converge.
+    s and s' are exact to rounding. The last bar moves fast: a step is divided if one series would not
+    converge.
 
     ## Known Returns
 
@@ -155,8 +158,9 @@ class SwingUp(GuardedTrack, _Chain):
         variants={"endless track": {"track": math.inf}, "three bars": {"bars": 3}},
     )
     difficulty = (
-        "Two unstable bars on one control, within a short track. Energy alone does not do it: both bars have "
-        "to come upright at the same moment and at rest, which the chaotic swing before makes hard to time."
+        "Two unstable bars share one control, on a short track. The right energy is not enough: both bars "
+        "must arrive upright at the same moment and at rest, which the chaotic swing before makes hard to "
+        "time."
     )
     hyperparameters = {
         "fast_ppo": {
@@ -166,8 +170,8 @@ class SwingUp(GuardedTrack, _Chain):
         },
     }  # fmt: skip
     note = """
-Best known is planning anew for each start. One recorded plan with time-varying feedback is nearly as good,
-for all starts are near to each other.
+The best known method plans anew for each start. One recorded plan with time-varying feedback is nearly as
+good, because all starts are close together.
 """
 
     steps_of_plan, batch, iterations, price, strength = 65, 32, 120, 0.05, 0.95
@@ -175,7 +179,7 @@ for all starts are near to each other.
 
     @property
     def plans(self) -> Plans:
-        """How the swing-up is planned; the feedback minds the angles most."""
+        """How the swing-up is planned; the feedback weighs the angles most."""
         weights = {"s": 0.1 / self.length**2, "s_dot": 0.1}
         for name in self.angles:
             weights |= {name: 1.0, f"{name}_dot": 0.02}
@@ -239,8 +243,8 @@ for all starts are near to each other.
         return self.bounds_of_support() | circle | {f"{name}_dot/8": turn for name in self.angles}
 
 
-class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
-    __doc__ = (SwingUp.__doc__ or "").replace("its support,", "a support that is weak,", 1)
+class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in the classes below)
+    __doc__ = (SwingUp.__doc__ or "").replace("its support,", "a weak support,", 1)
     id = "DoubleBarWeak-v0"
     defaults = {**SwingUp.defaults, "track": 0.5}
     largest = 5.0
@@ -255,8 +259,9 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     }  # fmt: skip
 
     difficulty = (
-        "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
-        "in over several swings, and a deviation at the top that a strong support would catch is lost."
+        "As with the strong support, but with half the acceleration on a shorter track: energy has to be "
+        "pumped in over several swings, and this support cannot catch deviations at the top that a strong "
+        "one could."
     )
 
 
@@ -266,7 +271,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
     largest = 15.0
     steps_of_plan, batch, iterations, price, strength = 150, 28, 180, 0.02, 0.85
-    quick = MappingProxyType({})  # what is planned at the control's limits cannot be corrected
+    quick = MappingProxyType({})  # feedback cannot correct a plan at the control's limits
 
     controllers = {name: SwingUp.controllers[name] for name in ("LQR", "plan + TVLQR")}
 
@@ -289,13 +294,13 @@ class SwingUpTriple(SwingUp):  # noqa: D101
         }
     }
     difficulty = (
-        "Three unstable bars on one control. The chain has to arrive nearly at rest in all three angles at "
-        "once, and what is planned at the limits of the control cannot be corrected on the way."
+        "Three unstable bars share one control. The chain has to arrive upright with all three bars nearly "
+        "at rest at once, and feedback cannot correct a plan that uses the control at its limits."
     )
     note = """
 When the board opened, one recorded plan with time-varying feedback was best; it nearly always catches the
 chain. One of PPO's seeds has learnt a better swing since. Plans that are improved for each start use the
-control at its limits, where feedback has no say, and lose the chain on the way.
+control at its limits, where feedback has no authority, and lose the chain on the way.
 """
 
 
@@ -321,26 +326,26 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
         {"observation_noise": None},
         knows="sees the exact state",
         tried={
-            "plan + TVLQR": "the best of 18 plans, followed by what is seen",
-            "filter + plan + TVLQR": "the same plan by the estimate of an extended Kalman filter on the "
-            "exact model; weight and drift the best of 13 pairs in 96 or 192 episodes each",
+            "plan + TVLQR": "the best of 18 plans, followed on the noisy observations",
+            "filter + plan + TVLQR": "the same plan, followed on the estimate of an extended Kalman filter "
+            "on the exact model; weight and drift the best of 13 pairs in 96 or 192 episodes each",
             "fast PPO": "5 million steps a seed, without memory",
         },
     )
     examples = dataclasses.replace(SwingUpTriple.examples, variants={"perfect": {"observation_noise": None}})
     difficulty = (
-        "In the linear approximation a filter's estimate would do, with control and track to spare. But "
-        "under what is left of the noise the chain strays farther than that reaches, and is lost on the way "
-        "up or at the top."
+        "In the linear approximation a filter's estimate is good enough, with control and track to spare. "
+        "But the remaining noise drives the chain out of the region where that approximation holds, and it "
+        "is lost on the way up or at the top."
     )
     note = """
-Best is the plan followed gently by a filter's estimate. Whoever sees the exact state hardly ever loses the
-chain. Nobody has tried to swing it up again once it is lost, or to choose motions that show more.
+The best agent follows the plan gently, on a filter's estimate. With the exact state the chain is hardly ever
+lost. Nobody has tried to swing it up again once it is lost, or to choose more informative motions.
 """
 
     @property
     def plans(self) -> Plans:
-        """Those of the task without noise."""
+        """The plans of the task without noise."""
         return dataclasses.replace(super().plans, of=SwingUpTriple.id)
 
 
@@ -350,20 +355,20 @@ class SwingUpAnywhere(SwingUp):
     ## Description
 
     Two uniform bars, one hinged to the end of the other, start at any angles, moving. Bring them upright by
-    moving their support, and back again whenever a kick has thrown them over. No recorded plan fits more than
+    moving their support, and again whenever a kick has thrown them over. No recorded plan fits more than
     a few of the starts.
 
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    The support must be able to stop inside the track, braking at U, the largest acceleration. Where the
-    wanted acceleration would make that impossible, the nearest one that does not is applied.
-    `env.unwrapped.control` tells which.
+    The support must be able to stop inside the track, braking at U, the largest acceleration. If the
+    requested acceleration would make that impossible, the nearest one that allows it is applied.
+    `env.unwrapped.control` is the acceleration applied.
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted, even with a kick in every step.
+    The bounds are proved for every accepted start, even with a kick in every step.
 
     ## Rewards
 
@@ -373,8 +378,8 @@ class SwingUpAnywhere(SwingUp):
 
     ## Starting State
 
-    The angles are anything, and the bars move. Starts from which the support cannot stop inside the track are
-    refused. The half width of s is a tenth of the track's.
+    The angles are arbitrary, and the bars move. Starts from which the support cannot stop inside the track
+    are refused. The half width of s is a tenth of the track's.
 
     After each step, with probability 0.005 (1 - 0.995^(dt/0.02) for another `dt`), a kick changes the last
     bar's rate by a uniform amount within ±1 rad/s.
@@ -385,7 +390,7 @@ class SwingUpAnywhere(SwingUp):
 
     ## Arguments
 
-    `track=math.inf` is a track without an end; the observation then divides s by 0.5 m. `bars` changes the
+    `track=math.inf` is an endless track; the observation then divides s by 0.5 m. `bars` changes the
     state and the spaces.
 
     ## Equations
@@ -394,12 +399,14 @@ class SwingUpAnywhere(SwingUp):
 
     ## Signs and Units
 
-    SI units. Angles are against straight down, not against the bar above: θ = 0 hangs and θ = π stands. They
-    grow counter-clockwise and are not wrapped. s is positive to the right and 0 in the middle of the track.
+    SI units. Angles are measured from straight down, not from the bar above: a bar hangs at θ = 0 and stands
+    at θ = π. They grow counter-clockwise and are not wrapped. s is positive to the right and 0 in the middle
+    of the track.
 
     ## Numerical Accuracy
 
-    s and s' are exact to rounding. The last bar whips: a step is divided where one series would not converge.
+    s and s' are exact to rounding. The last bar moves fast: a step is divided if one series would not
+    converge.
 
     ## Known Returns
 
@@ -426,11 +433,11 @@ class SwingUpAnywhere(SwingUp):
     }
     difficulty = (
         "No two episodes need the same swing-up, so one has to be found each time, by planning or by a "
-        "policy that knows all of them; and kicks throw the bars over when they stand."
+        "policy that covers them all; and kicks throw upright bars over."
     )
     note = """
-Best known is planning on the exact model, anew at the start and whenever a kick has spoilt the plan. Holding
-alone works only once the bars happen to come by upright slowly.
+The best known method plans on the exact model, at the start and whenever a kick has spoilt the plan. Holding
+alone works only if the bars happen to pass upright slowly.
 """
 
     @property
@@ -458,13 +465,13 @@ class Balance(_Chain):
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted, even with a kick in every step.
+    The bounds are proved for every accepted start, even with a kick in every step.
 
     ## Rewards
 
-    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, the mean taken over the bars, at the step's end and
-    before a kick; S is half the track. Inside the limits that lies between 0 and 1. With another `dt` rewards
-    are scaled by dt/0.02.
+    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, with the mean over the bars, taken at the step's end and
+    before a kick; S is half the track. Inside the limits the reward lies between 0 and 1. With another `dt`
+    rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -487,9 +494,9 @@ class Balance(_Chain):
 
     ## Signs and Units
 
-    SI units. Angles are against straight down, not against the bar below: θ = π stands. They grow
-    counter-clockwise and are not wrapped, so θ = -π is another angle and outside the limits. s is positive to
-    the right.
+    SI units. Angles are measured from straight down, not from the bar below: a bar stands at θ = π. They grow
+    counter-clockwise and are not wrapped, so θ = -π is a different angle and outside the limits. s is
+    positive to the right.
 
     ## Numerical Accuracy
 
@@ -557,8 +564,8 @@ class Balance(_Chain):
         },
     )
     difficulty = (
-        "Two unstable bars on one control, and kicks at random. To push the bars back the support must first "
-        "move the wrong way, which uses up the track."
+        "Two unstable bars share one control, and kicks come at random. To push the bars back, the support "
+        "must first move the wrong way, which uses up the track."
     )
     hyperparameters = {
         "fast_ppo": {
@@ -567,11 +574,11 @@ class Balance(_Chain):
         },
     }  # fmt: skip
     note = """
-The LQR is tuned for small deviations; feedback whose gains were searched for directly bears larger kicks.
+The LQR is tuned for small deviations; feedback with directly optimised gains survives larger kicks.
 """
 
     def check(self) -> None:
-        """Ask for a track: the task ends at its ends."""
+        """Require a finite track: the episode ends at its ends."""
         if math.isinf(self.scene.track):
             raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
 

@@ -14,16 +14,16 @@ from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
 
-#: Steps of 0.05 s: the horizon of 1/(1 - gamma) steps is as long in seconds.
+#: For steps of 0.05 s: the horizon of 1/(1 - gamma) steps keeps its length in seconds.
 _PPO = {"gamma": 0.98, "gae_lambda": 0.95}
 
-#: What is observed, with its unit.
+#: The observed quantities with their units.
 _ROLLING = {"theta": ("rad", "angle of the small cylinder's axis"), "theta_dot": ("rad/s", "its rate")}
 _SHELL = {**_ROLLING, "psi_dot": ("rad/s", "rate of the shell")}
 
 
 class _Shell(Task):
-    """What the two tasks that turn the shell have in common."""
+    """What the two tasks that turn the shell share."""
 
     scene: Any = CylinderInCylinder
     interval, steps = 0.05, 200
@@ -44,11 +44,11 @@ class _Shell(Task):
 
     @property
     def edges(self) -> Sequence[Sequence[float]]:
-        """The shell at its fastest, to either side."""
+        """The shell turning at its fastest, in either direction."""
         return [[0.0, 0.0, rate] for rate in (-self.fastest_shell, self.fastest_shell)]
 
     def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
-        """Return U·a, cut back so that the shell's rate stays within its limit at the step's end."""
+        """Return U·a, clipped so that the shell's rate stays within its limit at the step's end."""
         low, high = (
             (rate - before.psi_dot) * (1.0 / dt) for rate in (-self.fastest_shell, self.fastest_shell)
         )
@@ -56,7 +56,7 @@ class _Shell(Task):
 
     @property
     def fastest(self) -> float:
-        """Speed of a fall, of a push from one limit of the shell's rate to the other, and of drag [rad/s]."""
+        """Speed from a fall, from a change of the shell's rate between its limits, and from drag [rad/s]."""
         push = self.coefficients([0.0, 0.0, 0.0], [1.0], np)
         return float(2.0 * math.sqrt(push.alpha) + (2.0 * push.delta + 1.0) * self.fastest_shell)
 
@@ -75,14 +75,14 @@ class _Shell(Task):
         }
 
     def bodies(self) -> Bodies:
-        """Add how far the cylinder may go."""
+        """Add the limits of the cylinder's angle."""
         scene, limits = self.scene, (-self.largest_angle, self.largest_angle)
         inner = scene.shell_radius - scene.radius
         lines = [Line([scene.place(a, inner), scene.place(a, scene.shell_radius)], "limit") for a in limits]
         return {**super().bodies(), "limits": lines}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the limits are."""
+        """Add the places of the limits."""
         return {**super().indicators(now, xp), "limits": (0.0, 0.0)}
 
     def check_start(self, state: Any) -> None:
@@ -111,11 +111,11 @@ class Tilt(_Shell):
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    It is cut back so that |ψ'| is at most 6 rad/s at the step's end.
+    It is clipped so that |ψ'| is at most 6 rad/s at the step's end.
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted.
+    The bounds are proved for every accepted start.
 
     ## Rewards
 
@@ -134,14 +134,15 @@ class Tilt(_Shell):
 
     `control` must be "tilt". A target must lie within ±1.05 rad.
 
-    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: (2
+    Any combination of values in these ranges is allowed as long as the step is short enough for the swing: (2
     √(k g/a) + (2 k I R/(m r² a) + 1) 6 rad/s) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 +
-    I/(m r²)). Every step is then taken, and observations stay within their space. Anything else is an error
+    I/(m r²)). Then no step is refused, and observations stay within their space. Anything else is an error
     that names the value.
 
     ## Equations
 
-    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate drags.
+    A round shell has no orientation: a static tilt does nothing. Its acceleration drives the cylinder, and
+    its rate drags it along.
     To hold the cylinder at 0.3 rad the shell must turn at 4.83 rad/s.
 
     ## Signs and Units
@@ -150,7 +151,7 @@ class Tilt(_Shell):
 
     ## Known Returns
 
-    The optimum is not known. docs/agents.md has what value iteration estimates of it.
+    The optimum is not known. docs/agents.md has the estimate of value iteration.
 
     ## Version History
 
@@ -206,12 +207,12 @@ class Tilt(_Shell):
     )
     difficulty = (
         "The shell drags the cylinder along only while it turns, and to hold an angle it has to keep "
-        "turning at one rate; the cylinder swings about that place with little damping."
+        "turning at a constant rate; the cylinder swings about that angle with little damping."
     )
     note = """
-Best is iLQR; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 and
+iLQR is best; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 and
 SAC are better than PPO, with far fewer steps. They reach the target nearly as soon as the controllers. Most
-of their loss comes afterwards: they stop beside the target, where the controllers end on it.
+of their loss comes afterwards: they stop beside the target, while the controllers end on it.
 """
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
@@ -225,7 +226,7 @@ of their loss comes afterwards: they stop beside the target, where the controlle
         return xp.abs(after.theta - target.target) <= 0.05
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return how far off the target an episode ends."""
+        """Return the distance from the target at the end of an episode."""
         off = 1e3 * np.abs(played.states[-1][:, 0] - played.targets)
         return {"off at the end [mrad], median": float(np.median(off))}
 
@@ -242,7 +243,7 @@ of their loss comes afterwards: they stop beside the target, where the controlle
         return {**super().bodies(), "goal": [Circle((0.0, 0.0), self.scene.radius, "target")]}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the target is."""
+        """Add the place of the target."""
         return {**super().indicators(now, xp), "goal": self.scene.place(now.target.target, xp=xp)}
 
     def check_target(self, target: Any) -> float:
@@ -259,17 +260,17 @@ class Pump(_Shell):
     ## Description
 
     A solid cylinder rolls inside a shell, with little drag and a weak drive. Pump its swing to the energy of
-    an amplitude of 0.9 rad, and keep it at that. One push is not enough: the drive has to follow the swing.
+    an amplitude of 0.9 rad, and keep it there. One push is not enough: the drive has to follow the swing.
 
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    It is cut back so that |ψ'| is at most 3 rad/s at the step's end.
+    It is clipped so that |ψ'| is at most 3 rad/s at the step's end.
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted.
+    The bounds are proved for every accepted start.
 
     ## Rewards
 
@@ -289,14 +290,15 @@ class Pump(_Shell):
 
     `control` must be "tilt".
 
-    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: (2
+    Any combination of values in these ranges is allowed as long as the step is short enough for the swing: (2
     √(k g/a) + (2 k I R/(m r² a) + 1) 3 rad/s) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 +
-    I/(m r²)). Every step is then taken, and observations stay within their space. Anything else is an error
+    I/(m r²)). Then no step is refused, and observations stay within their space. Anything else is an error
     that names the value.
 
     ## Equations
 
-    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate drags.
+    A round shell has no orientation: a static tilt does nothing. Its acceleration drives the cylinder, and
+    its rate drags it along.
 
     ## Signs and Units
 
@@ -304,7 +306,7 @@ class Pump(_Shell):
 
     ## Known Returns
 
-    The optimum is not known. docs/agents.md has what value iteration estimates of it.
+    The optimum is not known. docs/agents.md has the estimate of value iteration.
 
     ## Version History
 
@@ -314,7 +316,7 @@ class Pump(_Shell):
     id = "CylinderInCylinderPump-v0"
     quantities = _SHELL
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.024, "control": "tilt"}
-    usable = {"gravity": (1e-3, 1e6)}  # without a field no energy belongs to the amplitude
+    usable = {"gravity": (1e-3, 1e6)}  # without gravity the amplitude has no energy
     largest, fastest_shell, largest_angle = 4.0, 3.0, 1.3
     amplitude = 0.9
 
@@ -362,10 +364,10 @@ class Pump(_Shell):
         "when the energy is right."
     )
     note = """
-Best is the greedy policy of value iteration. Doing nothing is a trap: every action costs effort before it
-pays. All learners in the table have escaped it. TD3 reaches the wanted energy as soon as the energy pump
-does, and then spends more on keeping it. PPO gets there later, except for one seed, and keeps it at lower
-cost than TD3.
+The greedy policy of value iteration is best. Doing nothing is a local optimum: every action costs effort
+before it pays. All learners in the table have escaped it. TD3 reaches the target energy as soon as the energy
+pump does, and then spends more effort on keeping it. PPO gets there later, except for one seed, and keeps the
+energy with less effort than TD3.
 """
 
     def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
@@ -409,8 +411,8 @@ class Damping(Task):
     ## Description
 
     A solid cylinder rolls without slipping inside a fixed hollow one. The control is a brake: the coefficient
-    of a drag that takes energy out. Kicks put energy back. Bring the cylinder to rest at the bottom. Braking
-    as hard as possible is not best: it makes the cylinder creep.
+    of a drag that removes energy. Kicks put energy back. Bring the cylinder to rest at the bottom. Braking
+    as hard as possible is not optimal: it makes the cylinder creep.
 
     ## Action Space
 
@@ -419,7 +421,7 @@ class Damping(Task):
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted, even with a kick in every step.
+    The bounds are proved for every accepted start, even with a kick in every step.
 
     ## Rewards
 
@@ -428,7 +430,7 @@ class Damping(Task):
 
     ## Starting State
 
-    Well up the wall, moving. Given starts must have contact and |θ| at most 1,000 rad.
+    High on the wall, moving. Given starts must have contact and |θ| at most 1,000 rad.
 
     After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes θ' by -3,
     -1.5, 1.5 or 3 rad/s, each equally likely.
@@ -441,13 +443,13 @@ class Damping(Task):
 
     `control` must be "damping"; `damping` is a constant drag that adds to the brake.
 
-    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: 2
+    Any combination of values in these ranges is allowed as long as the step is short enough for the swing: 2
     √(k g/a) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 + I/(m r²)). Every step is then taken,
     and observations stay within their space. Anything else is an error that names the value.
 
     ## Equations
 
-    The motion is overdamped where the drag slows it at a rate of 2 ω₀ = 8.1/s or more.
+    The motion is overdamped if the drag slows it at a rate of 2 ω₀ = 8.1/s or more.
 
     ## Signs and Units
 
@@ -455,7 +457,7 @@ class Damping(Task):
 
     ## Known Returns
 
-    The optimum is not known. docs/agents.md has what value iteration estimates of it.
+    The optimum is not known. docs/agents.md has the estimate of value iteration.
 
     ## Version History
 
@@ -468,7 +470,7 @@ class Damping(Task):
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
     usable = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell
     action = {"drag": (0.0, 2.4)}
-    start = {"theta": 0.8, "theta_dot": 1.0}  # well up the wall, moving
+    start = {"theta": 0.8, "theta_dot": 1.0}  # high on the wall, moving
     draws = 2
 
     goal = Goal(
@@ -512,12 +514,13 @@ class Damping(Task):
     )
     difficulty = (
         "Too little drag lets the cylinder swing on, too much makes it creep, and too much speed makes it "
-        "leave the shell: the best brake changes with the motion."
+        "leave the shell: the best drag changes with the motion."
     )
     note = """
-Best is the greedy policy of value iteration. The switching line is as good within the uncertainty of these
-episodes: let go, and brake fully where that leads straight to rest. PPO is near rest for as much of the time
-as the line, but close to it for less, because its network does not resolve the corner of the switching line.
+The greedy policy of value iteration is best. The switching line is as good within the uncertainty of these
+episodes: it lets go, and brakes fully as soon as that leads straight to rest. PPO is near rest as much of the
+time as the switching line, but very close to rest for less of it, because its network does not resolve the
+corner of the line.
 """
 
     def check(self) -> None:
@@ -544,7 +547,7 @@ as the line, but close to it for less, because its network does not resolve the 
         return after.theta * after.theta + after.theta_dot * after.theta_dot / self.omega0_squared() <= 0.1**2
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return how much of the time the cylinder is near rest, and nearer."""
+        """Return the shares of time in which the cylinder is near rest, and very near."""
         theta, rate = played.states[1:, :, 0], played.states[1:, :, 1]
         distance = np.hypot(theta, rate / np.sqrt(self.omega0_squared()))
         going_on = np.arange(len(theta))[:, None] < played.steps
@@ -557,7 +560,7 @@ as the line, but close to it for less, because its network does not resolve the 
         return after.theta_dot * after.theta_dot + hold * xp.cos(after.theta) < 0.0
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
-        """Change θ' by ±1.5 or ±3 rad/s, now and then."""
+        """Occasionally change θ' by ±1.5 or ±3 rad/s."""
         size = xp.where(draws[1] < 0.5, 1.5, 3.0)
         push = xp.where((draws[1] < 0.25) | (draws[1] >= 0.75), -size, size)
         return {"theta_dot": xp.where(draws[0] < self.chance(0.01), push, 0.0)}
@@ -576,7 +579,7 @@ as the line, but close to it for less, because its network does not resolve the 
         return {**super().bodies(), "goal": [Circle(self.scene.place(0.0), self.scene.radius, "target")]}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the frame of the place of rest is."""
+        """Add the frame of the place of rest."""
         return {**super().indicators(now, xp), "goal": (0.0, 0.0)}
 
     def check_start(self, state: Any) -> None:

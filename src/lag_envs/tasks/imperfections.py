@@ -1,6 +1,6 @@
 """Hidden parameters, imperfect sensors and actuators: the keywords that every environment takes.
 
-What is asked for is checked here and kept as numbers; `lag_envs.envs.imperfect` prints what they do.
+The keywords are checked here and stored as numbers; `lag_envs.envs.imperfect` prints their code.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ KEYWORDS = (
     "lag",
     "push",
 )
-#: No normal draw is larger: √(2 · 53 log 2), since the uniform number that it is made of is at least 2^-53.
+#: No normal draw is larger: √(2 · 53 log 2), since the uniform number behind it is at least 2^-53.
 LARGEST_NORMAL = math.sqrt(106.0 * math.log(2.0)) * (1.0 + 1e-9)
 #: Control steps by which actions and observations may be late.
 LATEST = 20_000
 #: Parameters that may be drawn: all corners of their ranges are tried.
 MOST_DRAWN = 8
-#: A delay this near to a whole number of control steps [steps] is one.
+#: A delay this near to a whole number of control steps is rounded to it [steps].
 _WHOLE = 1e-9
-#: By this share a bound is wider where it is not proved; what lies beyond it is shown as the bound.
+#: Bounds that are not proved are wider by this share; values beyond them are clipped.
 MARGIN = 0.1
 _UNBOUNDED = float(np.finfo(np.float32).max)
 
 
 def normals(first: Any, second: Any, xp: Any) -> list[Any]:
-    """Return two normal numbers, made of two uniform ones in [0, 1)."""
+    """Return two normal numbers, computed from two uniform ones in [0, 1)."""
     radius, angle = xp.sqrt(-2.0 * xp.log(1.0 - first)), 2.0 * math.pi * second
     return [radius * xp.cos(angle), radius * xp.sin(angle)]
 
@@ -76,16 +76,16 @@ class Draw(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Imperfections:
-    """What differs from perfect sensors, perfect actuators and known parameters; all numbers are checked.
+    """Checked deviations from perfect sensors, perfect actuators and known parameters.
 
     Attributes
     ----------
     drawn : tuple of Draw
-        Parameters that each episode has its own values of.
+        Parameters that are drawn for each episode.
     observation_noise : tuple of float
         Standard deviation for each entry of the observation, in its unit.
     observation_delay : float
-        How old what is seen is [control steps].
+        Age of the observations [control steps].
     observation_every : int
         Control steps from one reading to the next.
     action_noise : tuple of float
@@ -93,11 +93,11 @@ class Imperfections:
     action_delay : (float, float)
         Shortest and longest time from an action to its effect [control steps].
     slew : tuple of float
-        For each control that actions set its largest change [SI unit per second]; infinity for any.
+        Largest change of each control that actions set [SI unit per second]; infinity for no limit.
     lag : tuple of float
-        For each control of the scene 1/τ of its actuator [1/s]; 0 for one that does as it is told.
+        1/τ of the actuator of each control of the scene [1/s]; 0 for one without a lag.
     push : tuple of float
-        For each entry of the state the largest size of a random impulse.
+        Largest size of a random impulse, for each entry of the state.
     push_rate : float
         Pushes per second.
     """
@@ -115,22 +115,22 @@ class Imperfections:
 
     @property
     def commands(self) -> int:
-        """How many actions are kept: those that may still come into force, and the one in force."""
+        """Number of stored actions: those that may still come into force, and the one in force."""
         return 1 + math.ceil(self.action_delay[1])
 
     @property
     def readings(self) -> int:
-        """How many observations are kept: those that are still to be seen."""
+        """Number of stored observations: those that are still to be shown."""
         return 1 + math.floor(self.observation_delay) if self.observation_delay else 0
 
     @property
     def within(self) -> bool:
-        """Whether what is seen lies within a control step."""
+        """Whether observations are taken within a control step."""
         return self.observation_delay % 1.0 > 0.0
 
     @property
     def structure(self) -> tuple:
-        """What decides the code; all else are numbers that it takes."""
+        """What determines the code; everything else is its input."""
         return (
             tuple((d.name, d.log) for d in self.drawn),
             tuple(x > 0.0 for x in self.observation_noise),
@@ -146,7 +146,7 @@ class Imperfections:
 
 
 def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | None:
-    """Return what keywords, and the task's own where they say nothing, ask for; None for nothing.
+    """Return the imperfections requested by keywords, or else by the task itself; None for none.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
 
 
 def _numbers(keyword: str, value: Any, names: Sequence[str], what: str, missing: float) -> tuple[float, ...]:
-    """Return a number for each name: from one for all, from a mapping, or from as many in a row."""
+    """Return a number for each name: from one number for all, a mapping, or a sequence."""
     if not names:
         raise ValueError(f"{keyword}: there is no {what} here, got {shown(value)}; leave it out")
     if isinstance(value, Mapping):
@@ -194,7 +194,7 @@ def _numbers(keyword: str, value: Any, names: Sequence[str], what: str, missing:
 
 
 def _sizes(keyword: str, value: Any, names: Sequence[str], what: str) -> tuple[float, ...]:
-    """Return numbers of at least 0; nothing at all where all are 0."""
+    """Return numbers of at least 0; an empty tuple if all are 0."""
     found = _numbers(keyword, value, names, what, 0.0)
     for name, x in zip(names, found, strict=True):
         if not 0.0 <= x < math.inf:
@@ -377,7 +377,7 @@ class Drawn:
     Raises
     ------
     ValueError
-        Where a corner of the ranges is no possible task, or would need other code than the others.
+        If a corner of the ranges is not a possible task, or would need different code.
     """
 
     def __init__(self, task: Task) -> None:
@@ -387,7 +387,7 @@ class Drawn:
         self._corners = [
             self.at(ends) for ends in itertools.product(*((d.at(0.0), d.at(1.0)) for d in self.draws))
         ]
-        #: One with values inside of all ranges.
+        #: One with values inside all ranges.
         self.inner = self.at([d.at(0.37 + 0.03 * i) for i, d in enumerate(self.draws)])
         for corner in self._corners:
             self._compare(corner)
@@ -423,7 +423,7 @@ class Drawn:
 
     @cached_property
     def made(self) -> dict[str, Callable[[Any], Any]]:
-        """Parameters that follow from others, and how."""
+        """Parameters computed from others, with their formulas."""
         scene = self.inner.scene
         complete(type(scene))
         fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
@@ -444,9 +444,9 @@ def seen_box(task: Task) -> tuple[list[float], list[float]]:
     """Return the lowest and highest values that an environment of this task shows.
 
     Its bounds are those of the task, for all parameters that may be drawn, and wider by the largest noise.
-    Tasks prove their bounds for given parameters, for controls that do as they are told and for the ends of
-    control steps. What parameters between those that were tried would need has a margin, and so has what is
-    seen within a step, or behind a lag that no guard can foresee.
+    Tasks prove their bounds for given parameters, for controls that follow their commands, and for the ends
+    of control steps. There is a margin for parameters between those that were tried, for observations within
+    a step, and for a lag, which no guard can foresee.
     """
     found = task.imperfections
     if found is None:

@@ -41,13 +41,13 @@ class Tilt(Task):
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    The rate is cut back so that |φ| is at most 0.1 rad at the step's end. With `control="tilt"` the control
-    is the tilt itself, 0.1 rad times the action, and each step is that of a plane at rest at that tilt.
+    The rate is clipped so that |φ| is at most 0.1 rad at the step's end. With `control="tilt"` the control
+    is the tilt itself, 0.1 rad times the action, and the plane rests at that tilt during each step.
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted. With `control="tilt"` there is x_dot in place of
-    w, and no phi.
+    The bounds are proved for every accepted start. With `control="tilt"`, x_dot replaces w, and there is no
+    phi.
 
     ## Rewards
 
@@ -71,7 +71,7 @@ class Tilt(Task):
 
     ## Equations
 
-    While the rate is held, φ̈ = 0. When it is switched, x' jumps by -R times the switch. The speed w = x' + R
+    While the rate is held, φ̈ = 0. When it changes, x' jumps by -R times the change. The speed w = x' + R
     φ', which is proportional to the momentum, does not jump, so w is in the state.
 
     ## Signs and Units
@@ -86,7 +86,7 @@ class Tilt(Task):
 
     ## Known Returns
 
-    The optimum is not known. docs/agents.md has what value iteration estimates of it.
+    The optimum is not known. docs/agents.md has the estimate of value iteration.
 
     ## Version History
 
@@ -96,7 +96,7 @@ class Tilt(Task):
     id = "InclineTilt-v0"
     quantities = {
         "x": ("m", "place along the plane"),
-        "w": ("m/s", "x' + R φ', the speed that the momentum goes with"),
+        "w": ("m/s", "x' + R φ', the speed proportional to the momentum"),
         "phi": ("rad", "tilt"),
         "target": ("m", "the mark x*"),
     }
@@ -147,12 +147,12 @@ class Tilt(Task):
         variants={"quasi-static": {"control": "tilt"}, "fixed target": {"target": 0.2}},
     )
     difficulty = (
-        "Tilting moves the cylinder twice: by the slope and by the plane that carries it, one against the "
-        "other. Whoever tilts too far cannot turn the plane back in time to stop."
+        "Tilting moves the cylinder in two opposite ways: by the slope, and by the plane that carries it. "
+        "After tilting too far, the plane cannot be turned back in time to stop."
     )
     note = """
-Best is iLQR, ahead of the cascade and of the greedy policy of value iteration, whose values are interpolated
-between targets. PPO reaches the mark later than the cascade, and stops beside it where the cascade ends on
+iLQR is best, ahead of the cascade and of the greedy policy of value iteration, whose values are interpolated
+between targets. PPO reaches the mark later than the cascade, and stops beside it, while the cascade ends on
 it.
 """
 
@@ -177,7 +177,7 @@ it.
         return {"x": 0.4, "x_dot": 0.3} if self.quasi_static else {"x": 0.4, "w": 0.3, "phi": 0.05}
 
     def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
-        """Return U·a, cut back so that the tilt stays within its limit at the step's end."""
+        """Return U·a, clipped so that the tilt stays within its limit at the step's end."""
         if self.quasi_static:
             return wanted
         low, high = ((limit - before.phi) * (1.0 / dt) for limit in (-self.largest_tilt, self.largest_tilt))
@@ -194,7 +194,7 @@ it.
         return xp.abs(after.x - target.target) <= 0.05
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return how far off the mark an episode ends."""
+        """Return the distance from the mark at the end of an episode."""
         off = 1e3 * np.abs(played.states[-1][:, 0] - played.targets)
         return {"off at the end [mm], median": float(np.median(off))}
 
@@ -249,7 +249,7 @@ it.
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where target, plank, limits and an arrow for the tilt or its rate are."""
+        """Return the places of target, plank, limits and an arrow for the tilt or its rate."""
         phi = now.q.phi
         return {
             "goal": self.scene.place(now.target.target, self.scene.radius, phi, xp),
@@ -286,7 +286,7 @@ class Brake(Task):
     ## Description
 
     A solid cylinder rolls without slipping down a slope of 15°. The control is a brake: the coefficient of a
-    drag. Let the cylinder cross a line soon, at 0.5 m/s or less. Time costs, and so does excess speed.
+    drag. Let the cylinder cross a line soon, at 0.5 m/s or less. Time and excess speed both cost.
 
     ## Action Space
 
@@ -294,12 +294,13 @@ class Brake(Task):
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted, at most 1,000 m before the line.
+    The bounds are proved for every accepted start, at most 1,000 m before the line.
 
     ## Rewards
 
-    Each step costs its 0.02 s. The step that crosses the line costs the time to the crossing, and 5 (v - 0.5)
-    where the speed v there is above 0.5 m/s. Both are those of the exact crossing, not of the step's end.
+    Each step costs its 0.02 s. The step that crosses the line costs the time to the crossing, plus
+    5 (v - 0.5) if the speed v there is above 0.5 m/s. Both are evaluated at the exact crossing, not at the
+    step's end.
 
     ## Starting State
 
@@ -324,14 +325,14 @@ class Brake(Task):
 
     ## Numerical Accuracy
 
-    Stepped in closed form, written so that nothing cancels for any drag. The crossing time is found by
-    Newton's method on the closed form, started just below it.
+    The motion is stepped in closed form, written so that no digits cancel at any drag. The crossing time is
+    found by Newton's method on the closed form, started just below it.
 
     ## Known Returns
 
-    The optimum is known: roll freely, then brake fully, from the best moment on. No policy exceeds it.
-    `lag_envs.controllers.optimal_return` returns it for any start. The best policy known acts at intervals
-    and so misses it by a little.
+    The optimum is known: roll freely, then brake fully from the best moment on. No policy exceeds it.
+    `lag_envs.controllers.optimal_return` returns it for any start. The best known policy acts at intervals
+    and so falls slightly short of it.
 
     ## Version History
 
@@ -368,10 +369,10 @@ class Brake(Task):
             "lag_envs.controllers.incline:SwitchingLine", tune={"speed": (0.45, 0.52)}
         ),
     }
-    # All that counts comes at the line, some hundred steps later.
+    # The decisive reward comes at the line, some hundred steps later.
     hyperparameters = {"ppo": {"gamma": 1.0, "gae_lambda": 0.98, "learning_rate": "lin_1e-3"}}
     value_iteration = ValueIteration(
-        # At rest on the line the time to the crossing is 0/0: the grid ends a hair before it.
+        # At rest on the line the time to the crossing is 0/0, so the grid ends just before it.
         (
             Axis("x [m]", -3.0, -1e-6, 80, scale=0.3, centre=-1e-6, level=4),
             Axis("x' [m/s]", 0.0, 3.4, 80, scale=0.5, centre=0.5, level=4),
@@ -380,7 +381,7 @@ class Brake(Task):
     )
     optimum = Optimum(
         "lag_envs.controllers:optimal_return",
-        "with a brake that is off, then full, from the best moment on",
+        "with the brake off, then fully on from the best moment",
     )
     examples = Examples(
         start={"state": [-1.5, 0.4]},
@@ -392,11 +393,11 @@ class Brake(Task):
         },
     )
     difficulty = (
-        "Braking early wastes time, braking late crosses too fast: the best policy switches once, and "
-        "where it does depends on the speed at the start."
+        "Braking early wastes time, braking late crosses too fast. The best policy switches once, at a "
+        "place that depends on the initial speed."
     )
     note = """
-Best is the switching line: roll freely, then brake fully along the curve that meets the line at the right
+The switching line is best: roll freely, then brake fully along the curve that meets the line at the right
 speed. It is slightly below the optimum, which may switch in the middle of a step. It beats the greedy policy
 of value iteration, whose grid smears the moment of switching. PPO has found the same strategy, but usually
 crosses a little too early and too fast, which costs more than the time it saves.
@@ -415,11 +416,11 @@ crosses a little too early and too fast, which costs more than the time it saves
         """Return the time to the line, and the speed there."""
         force = self.coefficients(before, control, xp)
         time = slope.crossing_time(before.x, before.x_dot, force, dt, xp)
-        # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
+        # Integrating x'' = pull - drag x' up to the line gives the speed there.
         return time, before.x_dot + force.acceleration * time + force.damping_rate * before.x
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return minus the time to the line, and minus the price of the speed there above the gentle one."""
+        """Return minus the time to the line, minus the price of excess speed there."""
         time, speed = self.crossing(before, control, dt, xp)
         return -time - self.price * xp.maximum(speed - self.gentle, 0.0)
 
@@ -463,7 +464,7 @@ crosses a little too early and too fast, which costs more than the time it saves
         return {**shapes, "line": [line], "glass": [Magnifier((0.0, 0.0), 2.2 * radius)]}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where they are; the ground begins before the line, or before a cylinder farther away."""
+        """Return their places; the ground begins before the line, or before a cylinder farther away."""
         scene, x, phi = self.scene, now.q.x, now.q.phi
         start = xp.minimum(-3.2, x - 0.2)
         return {
@@ -473,7 +474,7 @@ crosses a little too early and too fast, which costs more than the time it saves
             "glass": scene.place(x, scene.radius, phi, xp),
         }
 
-    #: How much of the slope is to be seen [m].
+    #: Visible length of the slope [m].
     _length = 3.6
 
     def window(self) -> Window:

@@ -1,4 +1,4 @@
-"""What was measured of the package's tasks: ``measured.json``, which ``python -m agents.scale`` writes."""
+"""Measurements of the package's tasks: ``measured.json``, which ``python -m agents.scale`` writes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-#: The file; its ``envs`` hold, by id, ``scale`` and ``reference``, set once, and what was ``measured`` since.
+#: The file; for each id, ``envs`` holds ``scale`` and ``reference``, set once, and later ``measured`` values.
 FILE = Path(__file__).with_name("measured.json")
 
 
 def measured(env_id: str) -> dict[str, Any]:
-    """Return what the file tells of an environment; nothing of one that was never measured."""
+    """Return the file's entry for an environment; empty for one that was never measured."""
     return _envs(FILE).get(env_id, {})
 
 
 def known() -> list[str]:
-    """Return the ids that were measured, in the order in which they came."""
+    """Return the measured ids, in the order in which they were added."""
     return list(_envs(FILE))
 
 

@@ -24,7 +24,7 @@ def wrapped(cosine: Any, sine: Any, xp: Any) -> Any:
 
 
 class _Rod(Task):
-    """What the tasks have in common: a weak torque is to make the rod stand."""
+    """What the tasks share: a rod that a weak torque is to swing up."""
 
     scene: Any = Pendulum
     interval, steps = 0.05, 200
@@ -40,24 +40,24 @@ class _Rod(Task):
         return {"upright": outlines(self.scene.bodies()["rod"]), **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the upright rod is."""
+        """Add the place of the upright rod."""
         return {**super().indicators(now, xp), "upright": (0.0, 0.0, 0.0)}
 
 
 class PendulumExact(_Rod):
-    """Swing a rod up by a weak torque and hold it: Gymnasium's Pendulum-v1, stepped exactly.
+    """Swing a rod up with a weak torque and hold it: Gymnasium's Pendulum-v1, stepped exactly.
 
     ## Description
 
     A uniform rod hangs from a motor that is too weak to lift it in one go. Spaces, rewards, starts and the
-    length of an episode are those of Gymnasium's `Pendulum-v1`, so a policy that was trained there runs here
-    as it is, and the other way round.
+    length of an episode are those of Gymnasium's `Pendulum-v1`, so a policy trained there runs here
+    unchanged, and vice versa.
 
     Two things differ. Gymnasium steps by semi-implicit Euler: within a swing the energy of the undriven rod
     is off by several per cent. Here the motion under the held torque is exact. And Gymnasium clips the rod's
-    speed at 8 rad/s, which takes energy away without a cause. Here the speed is free, and only what is
-    *observed* of it is clipped, to the same 8 rad/s that the space allows. Random play passes that speed
-    often. The reward uses the true one.
+    speed at 8 rad/s, which removes energy without a physical cause. Here the speed is free, and only its
+    *observation* is clipped, to the same 8 rad/s that the space allows. Random actions often exceed that
+    speed. The reward uses the true one.
 
     ## Action Space
 
@@ -87,7 +87,7 @@ class PendulumExact(_Rod):
 
     ## Equations
 
-    Gymnasium has the same equation, θ'' = 3g/(2l) sinθ + 3/(m l²) u.
+    The equation is the same as Gymnasium's, θ'' = 3g/(2l) sinθ + 3/(m l²) u.
 
     ## Signs and Units
 
@@ -95,8 +95,8 @@ class PendulumExact(_Rod):
 
     ## Numerical Accuracy
 
-    Two ways of stepping one equation part company after a while, so the episodes are not the same step by
-    step: the returns of a policy are.
+    Two integrators of the same equation diverge after a while, so episodes do not agree step by step. The
+    returns of a policy do agree.
 
     ## Known Returns
 
@@ -135,9 +135,10 @@ class PendulumExact(_Rod):
         },
     )
     difficulty = (
-        "The motor holds the rod only within some 24 degrees of upright, so energy has to be pumped in first."
+        "The motor can hold the rod only within some 24 degrees of upright, so energy must be pumped in "
+        "first."
     )
-    note = "Best is energy shaping, which hands over to an LQR near upright. Nothing else was tried."
+    note = "Energy shaping, which hands over to an LQR near upright, is best. Nothing else was tried."
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosθ, sinθ and the clipped θ'."""
@@ -155,14 +156,14 @@ class PendulumExact(_Rod):
 
 
 class PendulumRegret(_Rod):
-    """Swing a rod up by a weak torque in a task whose optimal policy and value are known exactly.
+    """Swing a rod up with a weak torque in a task whose optimal policy and value are known exactly.
 
     ## Description
 
-    A uniform rod hangs from a motor that is too weak to lift it in one go. Swing it up and hold it. What is
-    special is the reward: it is built backwards, from a value function and a policy that were chosen first
-    (converse optimality [1]_), on the exact motion of the step. So the regret of any policy is an absolute
-    number, to rounding: there is no "best known" that could be beaten.
+    A uniform rod hangs from a motor that is too weak to lift it in one go. Swing it up and hold it. The
+    reward is special: it is constructed backwards, from a value function and a policy that were chosen first
+    (converse optimality [1]_), on the exact motion of the step. So the regret of any policy is known to
+    rounding: there is no "best known" return that could be beaten.
 
     .. [1] J. C. Doyle, J. A. Primbs, B. Shapiro and V. Nevistić, "Nonlinear games: examples and
        counterexamples", IEEE Conference on Decision and Control (1996), 3915-3920.
@@ -173,24 +174,23 @@ class PendulumRegret(_Rod):
 
     ## Observation Space
 
-    The angle's cosine and sine, and the speed, divided by 8. Its bound is proved: torque and weight can add
-    so much within an episode, and friction only takes.
+    The angle's cosine and sine, and the speed, divided by 8. The speed's bound is proved: it is the largest
+    speed that torque and weight can add within an episode, and friction only reduces it.
 
     ## Rewards
 
-    Let V be the energy that is missing, plus that which is too much: what the rod's height lacks of upright,
-    and its kinetic energy, together as a share of what lies between hanging and upright, times 100. And let
-    π be a law of the state: far from upright a torque that pumps the energy to that of the upright rest,
-    near it a damped spring. Each step pays
+    Let V be the potential energy that the rod lacks from upright, plus its kinetic energy, as a share of the
+    potential energy between hanging and upright, times 100. And let π be a control law: far from upright a
+    torque that pumps the energy to that of the upright equilibrium, near it a damped spring. Each step pays
 
     V(before) - V(after) - 0.2 ((u - π(before))/U)².
 
-    The sum over an episode is V(start) - V(end) - 0.2 Σ((u - π)/U)². As V is nowhere below 0, no policy gets
-    more than V(start); π gets V(start) - V(end), and brings V to nothing.
+    The sum over an episode is V(start) - V(end) - 0.2 Σ((u - π)/U)². As V is nowhere negative, no policy gets
+    more than V(start); π gets V(start) - V(end), and brings V close to 0.
 
-    It is no recipe, though. The law is not observed. Pumping raises V at first, so whoever takes what the
-    next step pays most brakes the rod and keeps it hanging: the penalty weighs little against that. With
-    another `dt` V's share of the reward is not scaled, so the bound stays.
+    The task is still not trivial. The law is not observed. Pumping raises V at first, so a policy that
+    maximises the next reward brakes the rod and keeps it hanging: the penalty is small compared with that.
+    With another `dt`, V's share of the reward is not scaled, so the bound remains valid.
 
     ## Starting State
 
@@ -202,7 +202,8 @@ class PendulumRegret(_Rod):
 
     ## Arguments
 
-    The law is made of the parameters. Where they leave the motor too weak for it, V(start) stays a bound.
+    The law is computed from the parameters. If they make the motor too weak for it, V(start) is still a
+    bound.
 
     ## Equations
 
@@ -259,11 +260,12 @@ class PendulumRegret(_Rod):
         },
     )
     difficulty = (
-        "The reward of a step misleads: it pays for a height that is lost again, and pumping first costs."
+        "The reward of a single step misleads: it pays for height that is lost again, and pumping costs at "
+        "first."
     )
     note = (
-        "The optimal law loses nothing but what the rod lacks of upright at the end. A good swing-up of "
-        "another kind pays for each torque that differs."
+        "The optimal law loses only V at the end, by how far the rod is from upright. A good swing-up of "
+        "another kind is penalised for each torque that differs."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

@@ -15,14 +15,14 @@ from lag_envs.tasks.base import FASTEST_START
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
 from lag_envs.tasks.track import GuardedTrack, Support
 
-#: Episodes of 5 s show twice as often how the bar is swung up; the evaluation has it held for 10 s.
+#: Episodes of 5 s contain swing-ups twice as often; evaluation episodes last 10 s.
 _SHORT = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 250}}
-#: Rewards that grow from nothing to hundreds are scaled by a number, not by their running spread.
+#: Returns that grow from nothing to hundreds are scaled by a constant, not by their running spread.
 _SCALED = {"normalize": False, "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 0.1}}]}
 
 
 class _Bar(Support):
-    """What the tasks with the bar have in common."""
+    """What the tasks with the bar share."""
 
     def _strength(self) -> tuple[float, float]:
         """Return field and largest drive [1/s²]."""
@@ -32,7 +32,7 @@ class _Bar(Support):
 
     @property
     def fastest(self) -> float:
-        """Speed of a fall in the field that the support makes stronger [rad/s]."""
+        """Speed of a fall in gravity plus the support's largest acceleration [rad/s]."""
         return 2.0 * math.sqrt(sum(self._strength()))
 
     def swing_bound(self) -> float:
@@ -53,12 +53,13 @@ class SwingUp(GuardedTrack, _Bar):
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    With a track the support must be able to stop inside it, braking at 5 m/s². Where the wanted acceleration
-    would make that impossible, the nearest one that does not is applied. `env.unwrapped.control` tells which.
+    With a track the support must be able to stop inside it, braking at 5 m/s². If the requested acceleration
+    would make that impossible, the nearest one that allows it is applied. `env.unwrapped.control` is the
+    acceleration applied.
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted.
+    The bounds are proved for every accepted start.
 
     ## Rewards
 
@@ -77,10 +78,10 @@ class SwingUp(GuardedTrack, _Bar):
 
     ## Arguments
 
-    `track=math.inf` is a track without an end (the observation then divides s by 0.5 m), `track=None` is no
+    `track=math.inf` is an endless track (the observation then divides s by 0.5 m), `track=None` is no
     track.
 
-    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: 2
+    Any combination of values in these ranges is allowed as long as the step is short enough for the swing: 2
     √((g + 5 m/s²) m L/(m L² + I)) dt must be at most 5,000 rad. Every step is then taken, and observations
     stay within their space. Anything else is an error that names the value.
 
@@ -99,7 +100,7 @@ class SwingUp(GuardedTrack, _Bar):
 
     ## Known Returns
 
-    The optimum is not known. docs/agents.md has what value iteration estimates of it.
+    The optimum is not known. docs/agents.md has the estimate of value iteration.
 
     ## Version History
 
@@ -134,8 +135,8 @@ class SwingUp(GuardedTrack, _Bar):
     hyperparameters = {
         "ppo": {**_SCALED, "env_wrapper": [_SHORT], "gamma": 0.99},
         "off_policy": {"env_wrapper": [_SHORT]},
-        # Hanging still, h² has no slope: half of the episodes start anywhere. The track's end
-        # is seconds away: what drifting there costs is for the critic to tell.
+        # At the hanging rest h² has no gradient, so half of the episodes start anywhere. The track's end
+        # is seconds away, so only the critic can price drifting towards it.
         "shac": {
             "n_steps": 32,
             "learning_rate": 2e-2,
@@ -161,11 +162,10 @@ class SwingUp(GuardedTrack, _Bar):
     )
     difficulty = (
         "The support is too weak to lift the bar in one go, so energy has to be pumped in over several "
-        "swings, within half a metre of track; at the top the bar is unstable and a late catch is a lost "
-        "one."
+        "swings, within half a metre of track. At the top the bar is unstable, and a late catch fails."
     )
     note = """
-Best is iLQR. It plans on the exact model, from both ends, and hands over to the LQR for the hold. Energy
+iLQR is best. It plans on the exact model, from both ends, and hands over to the LQR for the hold. Energy
 shaping pumps until the energy is that of upright, then waits for the bar to get there. PPO's seeds are nearly
 as good, except one that misses the catch from some starts and keeps swinging. The estimate by value iteration
 is for the bar without a track, so nobody knows whether the difference can be gained. TD3 and SAC get as far
@@ -202,11 +202,11 @@ on most seeds, with a fifth of PPO's steps.
         return {"upright": [self.scene.outline("target")], **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the upright bar is."""
+        """Add the place of the upright bar."""
         return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
 
 
-class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
+class SwingUpFree(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted)
     __doc__ = (SwingUp.__doc__ or "").replace("its support,", "its support, without a track,", 1)
     id = "PivotedBarFree-v0"
     defaults = {**SwingUp.defaults, "track": None}
@@ -251,12 +251,12 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
     )
     difficulty = (
         "The support is too weak to lift the bar in one go: energy has to be pumped in over several "
-        "swings, and the unstable upright rest caught at the right speed."
+        "swings, and the unstable upright equilibrium caught at the right speed."
     )
     note = """
-Best is iLQR. It beats the greedy policy of value iteration, whose switching times are smeared over a cell of
+iLQR is best. It beats the greedy policy of value iteration, whose switching times are smeared over a cell of
 the grid. PPO's seeds differ in how soon the bar is up. Energy shaping stops pumping once the energy is right,
-which is too cautious without a track to watch.
+which is too cautious without a track's ends to avoid.
 """
 
 
@@ -265,17 +265,17 @@ class SwingUpUnknown(SwingUp):
 
     ## Description
 
-    The swing-up of `PivotedBar-v0` with a bar that is another one in each episode. How far its centre of mass
-    is from the pivot, and how much the pivot is damped, is drawn anew and cannot be observed; the bar's
+    The swing-up of `PivotedBar-v0` with a different bar in each episode. The distance of its centre of mass
+    from the pivot and the damping of the pivot are drawn anew and cannot be observed; the bar's
     moment of inertia follows. Sensors are noisy, and each action takes effect one step late.
 
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step, the one after
-    that in which it is given; in the first step the support moves on as it is.
+    the step in which it is given; in the first step the support keeps its speed.
 
-    The support must be able to stop inside its track, braking at 5 m/s². Where the wanted acceleration would
-    make that impossible, the nearest one that does not is applied.
+    The support must be able to stop inside its track, braking at 5 m/s². If the requested acceleration would
+    make that impossible, the nearest one that allows it is applied.
 
     ## Observation Space
 
@@ -290,8 +290,8 @@ class SwingUpUnknown(SwingUp):
     ## Starting State
 
     The bar hangs, nearly at rest. The distance of its centre of mass is 0.3 m times a factor in [1/2, 2], the
-    damping 0.001 N m s times one in [1/10, 10], both uniform in the logarithm. `env.unwrapped.parameters` has
-    them.
+    damping 0.001 N m s times a factor in [1/10, 10], both log-uniform. `env.unwrapped.parameters` holds the
+    drawn values.
 
     ## Episode End
 
@@ -299,9 +299,9 @@ class SwingUpUnknown(SwingUp):
 
     ## Arguments
 
-    Those of `PivotedBar-v0`. `randomize=None`, `observation_noise=None` and `action_delay=None` switch off
-    what makes the bar unknown. Factors refer to the parameters that are given; every bar that may be drawn
-    must lie in the ranges.
+    Those of `PivotedBar-v0`. `randomize=None`, `observation_noise=None` and `action_delay=None` switch the
+    imperfections off. Factors apply to the given parameters; every bar that may be drawn must lie in the
+    ranges.
 
     ## Signs and Units
 
@@ -310,7 +310,7 @@ class SwingUpUnknown(SwingUp):
 
     ## Known Returns
 
-    The optimum is not known. It is below that of a controller that is designed for each episode's bar.
+    The optimum is not known. It is below the return of a controller that is designed for each episode's bar.
 
     ## Version History
 
@@ -348,13 +348,13 @@ class SwingUpUnknown(SwingUp):
         variants={"known": {"randomize": None}, "perfect": {"observation_noise": None, "action_delay": None}},
     )
     difficulty = (
-        "A short bar falls three times as fast as a long one: energy to pump and gains to balance with have "
-        "to be found from noisy observations while the bar moves."
+        "A short bar falls three times as fast as a long one: the energy to pump and the balancing gains "
+        "must be inferred from noisy observations while the bar moves."
     )
     note = """
-Best is the adaptive controller: it estimates length and friction while the bar moves, and knows that actions
-are late. Energy shaping with the LQR is designed for the nominal bar, and fails with much longer or shorter
-ones.
+The adaptive controller is best: it estimates length and friction while the bar moves, and takes the delay of
+actions into account. Energy shaping with the LQR is designed for the nominal bar, and fails with much longer
+or shorter ones.
 """
 
 
@@ -372,12 +372,12 @@ class Balance(_Bar):
 
     ## Observation Space
 
-    The bounds are proved for every start that is accepted, even with a kick in every step.
+    The bounds are proved for every accepted start, even with a kick in every step.
 
     ## Rewards
 
     Each step pays 1 - (e/0.35)²/2 - (s/S)²/2, taken at its end and before a kick; S = 0.5 m is half the
-    track. Inside the limits that lies between 0 and 1. With another `dt` rewards are scaled by dt/0.02.
+    track. Inside the limits the reward lies between 0 and 1. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -394,7 +394,7 @@ class Balance(_Bar):
 
     The track must be finite here.
 
-    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: 2
+    Any combination of values in these ranges is allowed as long as the step is short enough for the swing: 2
     √((g + 3 m/s²) m L/(m L² + I)) dt must be at most 5,000 rad. Every step is then taken, and observations
     stay within their space. Anything else is an error that names the value.
 
@@ -405,7 +405,7 @@ class Balance(_Bar):
     ## Signs and Units
 
     SI units. θ = 0 hangs straight down and θ = π stands; θ grows counter-clockwise and is not wrapped, so θ =
-    -π is another angle and outside the limits. s is positive to the right.
+    -π is a different angle and outside the limits. s is positive to the right.
 
     ## Numerical Accuracy
 
@@ -413,8 +413,8 @@ class Balance(_Bar):
 
     ## Known Returns
 
-    The optimum is not known. Some kicks cannot be survived, so it lies below 500. docs/agents.md has what
-    value iteration estimates of a far easier task.
+    The optimum is not known. Some kicks cannot be survived, so it lies below 500. docs/agents.md has the
+    estimate of value iteration for a far easier task.
 
     ## Version History
 
@@ -453,7 +453,7 @@ class Balance(_Bar):
     }
     value_iteration = ValueIteration(
         (Axis("θ [rad]", math.pi - 0.35, math.pi + 0.35, 80), Axis("θ' [rad/s]", -3.5, 3.5, 80)),
-        # On a track so long, neither its ends nor the cost of s are ever felt.
+        # On such a long track, neither its ends nor the cost of s matter.
         options={"track": 1e9},
         keep=(2, 3),
         pushes=16,
@@ -471,23 +471,23 @@ class Balance(_Bar):
         },
     )
     difficulty = (
-        "The upright rest is unstable, kicks come at random, and to push the bar back the support must "
-        "first move the wrong way: what saves the bar uses up the track."
+        "The upright equilibrium is unstable, kicks come at random, and to push the bar back the support "
+        "must first move the wrong way: saving the bar uses up the track."
     )
     note = """
-Best is the LQR, with weights tuned for the kicks; PPO is as good within the uncertainty of these episodes.
-The episodes are unlucky ones: over many more the LQR's return is the one called best known here. Both lose
-the bar in about as many episodes.
+The LQR is best, with weights tuned for the kicks; PPO is as good within the uncertainty of these episodes.
+These episodes are unlucky: the best known return given here is the LQR's mean over many more. Both lose
+the bar in about the same number of episodes.
 """
 
     def check(self) -> None:
-        """Ask for a track: the task ends at its ends."""
+        """Require a finite track: the episode ends at its ends."""
         if self.scene.track is None or math.isinf(self.scene.track):
             raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
 
     @property
     def track(self) -> Any:
-        """The support's travel to either side [m]; `check` has asked for one."""
+        """The support's travel to either side [m]; `check` ensures that it is finite."""
         return self.scene.track
 
     @property
@@ -510,7 +510,7 @@ the bar in about as many episodes.
         return {"episodes that last 10 s [%]": 100.0 * float((played.steps == self.limit).mean())}
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
-        """Change θ' by up to 1 rad/s to either side, now and then."""
+        """Occasionally change θ' by up to 1 rad/s to either side."""
         return {"theta_dot": xp.where(draws[0] < self.chance(0.01), 2.0 * draws[1] - 1.0, 0.0)}
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -530,14 +530,14 @@ the bar in about as many episodes.
         }
 
     def bodies(self) -> Bodies:
-        """Add the upright bar, and how far it may lean."""
+        """Add the upright bar, and the limits of its lean."""
         up, reach = 0.5 * math.pi, self.scene.reach
         limits = [up - self.largest_angle, up + self.largest_angle]
         lines = [Line([polar((0.0, 0.0), r * reach, a) for r in (0.9, 1.05)], "limit") for a in limits]
         return {"upright": [self.scene.outline("target")], **super().bodies(), "lean": lines}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where they are."""
+        """Add their places."""
         places = {"upright": (now.q.s, 0.0, math.pi), "lean": (now.q.s, 0.0)}
         return {**super().indicators(now, xp), **places}
 

@@ -1,6 +1,6 @@
 """The data of a task beside its formulas: goal, controllers, hyperparameters, grids, examples.
 
-A task's class holds them as the attributes that `lag_envs.tasks.Task` lists. Code is named,
+A task's class holds them as the attributes that `lag_envs.tasks.Task` lists. Code is given by name,
 "module:function", and resolved where it is used, so a task imports no controller, learner or leaderboard.
 """
 
@@ -13,19 +13,21 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Goal:
-    """When an episode counts as a success. `Task.reached` decides where the goal holds. A goal makes a board.
+    """When an episode counts as a success. `Task.reached` decides whether the goal holds in a state.
+
+    A task with a goal has a board.
 
     Parameters
     ----------
     text : str
         Success and time, in words.
     hold : float or None
-        The goal must hold without a break during this many seconds at the episode's end. None: it need not.
+        The goal must hold without a break for this many seconds at the episode's end. None: it need not.
     terminated : bool or None
         Whether the episode must have terminated. None: it must not, and reaching the goal does not matter.
     arrival : str
-        What is reached then, in a word or two. docs/agents.md reports when that is, and what is lost by then;
-        with an empty string it does not.
+        Name of the event of reaching the goal, in a word or two. docs/agents.md reports its time and the
+        reward lost until then; with an empty string it does not.
     rules : int
         Version of the board's rules: 2 adds to its disturbances imperfect sensors and actuators, and hidden
         parameters. A board keeps the version that it began with.
@@ -45,7 +47,7 @@ class Controller:
     Parameters
     ----------
     place : str
-        Where it is made from the task, "module:function".
+        Function that makes it from the task, "module:function".
     numbers : mapping
         Its keyword arguments.
     tune : mapping
@@ -68,18 +70,18 @@ class Plans:
     ----------
     place : str
         Function of the task, "module:function". It returns a task on the same scene that is easier to plan
-        for, and what the end of a plan costs, a function from states (n, n_state) to numbers (n,).
+        for, and the terminal cost of a plan, a function from states (n, n_state) to numbers (n,).
     numbers : mapping
         Its keyword arguments.
     steps : int
         Steps of the easier task in a plan that is followed.
     quick : mapping
-        What is different for a plan that is not followed, but that each episode's own plan begins from: other
+        Differences for the plan that serves as initial guess of each episode's own plan: other
         `numbers`, ``steps``, ``batch`` or ``iterations``.
     batch : int
-        Guesses that are improved at once.
+        Number of guesses that are improved at once.
     iterations : int
-        At most so many improvements.
+        Largest number of improvements.
     rest : sequence of float
         The equilibrium in which a plan should end.
     weights : mapping of str to float
@@ -87,8 +89,8 @@ class Plans:
     effort : float
         Weight of the square of an action's deviation.
     smooth : mapping
-        Parameters of the scene that differ in the model of the feedback: dry friction at rest is so steep
-        that its slope misleads.
+        Parameters of the scene that differ in the model of the feedback: dry friction is so steep at rest
+        that its linearisation misleads.
     of : str
         Id of the task whose recorded plans are followed; empty: its own.
     """
@@ -108,18 +110,18 @@ class Plans:
 
 @dataclass(frozen=True)
 class Open:
-    """That a task is open: the best policies known stay far below a reference with privileged knowledge.
+    """Marks an open task: the best known policies stay far below a reference with privileged knowledge.
 
     Parameters
     ----------
     controller : str
         Name of the controller of the task that is the reference.
     options : mapping
-        Keywords of the environment in which it plays: those that give it what policies lack.
+        Keywords of the environment in which it plays, which give it the privileged knowledge.
     knows : str
-        What it knows that they do not, in words.
+        The privileged knowledge, in words.
     tried : mapping of str to str
-        What was tried: methods, and the budget of each.
+        The attempts: methods, and the budget of each.
     """
 
     controller: str
@@ -135,7 +137,7 @@ class Optimum:
     Parameters
     ----------
     place : str
-        Function of the task and the entries of the states that returns it, "module:function".
+        Function of the task and the entries of the states that returns the optimum, "module:function".
     text : str
         The optimal policy, in words.
     """
@@ -146,7 +148,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a grid: its range, and where its nodes are dense.
+    """One axis of a grid: its range, and the density of its nodes.
 
     Parameters
     ----------
@@ -157,8 +159,8 @@ class Axis:
     cells : int
         Cells at level 1, even; twice as many at level 2.
     scale : float, optional
-        Within this distance of the centre the nodes are evenly spaced, farther out ever wider. None: all
-        even.
+        Within this distance of the centre the nodes are evenly spaced, farther out ever wider. None: evenly
+        spaced everywhere.
     centre : float or "target"
         Where nodes are densest.
     periodic : bool
@@ -203,8 +205,8 @@ class ValueIteration:
     mirror : str
         Entry of the state, or ``"target"``, by whose sign the submitted table is mirrored. Empty: none.
     relaxed : str
-        Id whose solution bounds this task from above, in place of its own grid. It is looked up at the
-        entries `keep` of the state.
+        Id of the task whose solution bounds this one from above, in place of an own grid. It is looked up at
+        the entries `keep` of the state.
     """
 
     axes: tuple[Axis, ...] = ()
@@ -228,7 +230,7 @@ class Examples:
     start : mapping
         Options of a reset: a ``state`` in mid-task, and a ``target`` where there is one.
     moving : sequence of float, optional
-        A faster state, for the recorded rollouts of the tests; by default that of `start`.
+        A faster state, for the recorded rollouts of the tests; by default the state of `start`.
     refused : sequence of mapping
         Options of resets that the task must refuse.
     ending : tuple, optional
@@ -240,7 +242,7 @@ class Examples:
     batch : mapping
         Parameters, one for each environment of a batch, mild and extreme ones.
     variants : mapping
-        By name, keywords of the environment that are not just numbers.
+        By name, keywords of the environment that change more than numbers.
     """
 
     start: Mapping[str, Any] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Tasks as environments of Gymnasium."""
+"""Registers tasks as Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from lag_envs.tasks import load_task
 
 
 def register(task: str | type[Any], *, id: str | None = None, **options: Any) -> str:
-    """Register a task with Gymnasium, so that `gym.make` and `gym.make_vec` make it.
+    """Register a task with Gymnasium, for `gym.make` and `gym.make_vec`.
 
     Parameters
     ----------
     task : type or str
-        The task's class, or where it stands: ``"module:Class"``.
+        The task's class, or its place: ``"module:Class"``.
     id : str, optional
         Name of the environment; by default the class's own ``id``.
     **options
@@ -30,12 +30,12 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
     Raises
     ------
     ValueError
-        Where there is no id.
+        If there is no id.
 
     Notes
     -----
-    A class that can be imported is registered by its place, so that specifications survive JSON. One that
-    stands in a notebook or inside a function is registered itself; worker processes then need cloudpickle,
+    A class that can be imported is registered by its place, so that specs can be serialised as JSON. A class
+    defined in a notebook or inside a function is registered itself; worker processes then need cloudpickle,
     which Gymnasium's `AsyncVectorEnv` and Stable-Baselines3's `SubprocVecEnv` use.
     """
     if isinstance(task, type):
@@ -56,17 +56,17 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
 
 
 def make_task(env_id: str, **options: Any) -> Any:
-    """Return the task of an environment that is registered, with parameters that differ from its own."""
+    """Return the task of a registered environment, with some of its parameters changed."""
     keywords = gym.spec(env_id).kwargs | options
     return load_task(keywords.pop("task"))(**keywords)
 
 
 def _place(task: type[Any]) -> str | type[Any]:
-    """Return "module:Class" where that leads to the class, else the class."""
+    """Return "module:Class" if that leads to the class, else the class."""
     found: Any = sys.modules.get(task.__module__)
     if task.__module__ == "__main__" and not hasattr(found, "__file__"):
         return task  # a notebook or a prompt: another process would not find it
     for part in task.__qualname__.split("."):
         found = getattr(found, part, None)
-    # While its module runs, a class that registers itself by a decorator is not there yet.
+    # While its module runs, a class that is registered by a decorator is not defined in it yet.
     return f"{task.__module__}:{task.__qualname__}" if found is task else task

@@ -1,4 +1,4 @@
-"""Swing Furuta's pendulum up by a torque on its arm."""
+"""Swing Furuta's pendulum up with a torque on its arm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 
 
 class RotarySwingUp(Task):
-    """Swing a pendulum up by turning the arm that carries it, and hold it upright with the arm in front.
+    """Swing a pendulum up by turning the arm that carries it; hold it upright, with the arm where it began.
 
     ## Description
 
@@ -31,9 +31,9 @@ class RotarySwingUp(Task):
 
     ## Rewards
 
-    Each step pays h² (0.8 + 0.2 cosφ)(1 - 0.1 a²). The height h = (1 - cosθ)/2 is 0 hanging and 1 upright,
-    taken at the step's end like φ; a is the action. Because of the square, a pendulum that only spins earns
-    little. With another `dt` rewards are scaled by dt/0.02.
+    Each step pays h² (0.8 + 0.2 cosφ)(1 - 0.1 a²). The height h = (1 - cosθ)/2 is 0 hanging and 1 upright;
+    h and φ are taken at the step's end; a is the action. Because of the square, a pendulum that only spins
+    earns little. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -124,13 +124,13 @@ class RotarySwingUp(Task):
         },
     )
     difficulty = (
-        "The motor is too weak to lift the pendulum in one go, and arm and pendulum push each other, the "
-        "faster the harder."
+        "The motor is too weak to lift the pendulum in one go, and the faster arm and pendulum move, the "
+        "harder they push each other."
     )
     note = (
-        "Best is a plan, found on the exact model and followed by feedback. Energy shaping pumps with the "
-        "arm's acceleration, then hands over to an LQR; it loses many a catch, for pumping does not mind "
-        "how fast the arm is."
+        "The best agent follows a plan, found on the exact model, with feedback. Energy shaping pumps with "
+        "the arm's acceleration, then hands over to an LQR; it often fails to catch the pendulum, because "
+        "pumping ignores the arm's speed."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

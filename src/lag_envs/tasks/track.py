@@ -1,4 +1,4 @@
-"""A support on a track: what the tasks share whose control is the support's acceleration."""
+"""A support on a track: the base of tasks whose control is the support's acceleration."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Support(Task):
 class GuardedTrack(Support):
     """Tasks whose support must be able to stop inside its track, braking at U.
 
-    The track is ``scene.track``: a half length S, infinity for a track without an end, or None where the
+    The track is ``scene.track``: a half length S, infinity for an endless track, or None if the
     support's place and speed are not part of the task.
     """
 
     def check(self) -> None:
-        """Note whether the support's place is part of the task, and whether its track ends."""
+        """Record whether the support's place is part of the task, and whether its track ends."""
         self.has_track = self.scene.track is not None
         self.ends = self.has_track and math.isfinite(self.scene.track)
 
@@ -47,7 +47,7 @@ class GuardedTrack(Support):
 
     @property
     def length(self) -> Any:
-        """The track's half length S, that of one without an end being 0.5 m."""
+        """The track's half length S; 0.5 m for an endless one."""
         return self.scene.track if self.ends else 0.5
 
     def start_of_support(self) -> dict[str, float]:
@@ -59,7 +59,7 @@ class GuardedTrack(Support):
         if not self.ends:
             return wanted
         # With v the speed at the step's end, and braking from there at U, the support stops at
-        # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, it passes S or -S where v² + |reach| > 2US.
+        # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U: it passes S or -S if v² + |reach| > 2US.
         s, s_dot, push = before.s, before.s_dot, wanted.s_ddot
         top, per_step = self.largest, self.largest * dt
         ends, start = 2.0 * (top * self.length), (2.0 * top) * s + per_step * s_dot
