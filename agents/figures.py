@@ -30,6 +30,7 @@ def figures(data: Data, folder: Path) -> list[Path]:
     if any(agent["kind"] == "learned" for env in envs.values() for agent in env["agents"].values()):
         drawn["agents-steps.png"] = curves_figure(envs, "steps")
         drawn["agents-seconds.png"] = curves_figure(envs, "seconds")
+    if any(env["improvement"] for env in envs.values()):
         drawn["agents-improvement.png"] = improvement_figure(envs)
     for env_id, env in envs.items():
         drawn[f"agents-robustness-{env_id}.png"] = robustness_figure(env_id, env)

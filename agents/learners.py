@@ -38,6 +38,7 @@ from agents.run import (
 )
 from lag_envs import __version__
 from lag_envs.evaluation.rollout import play
+from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.scores import known_returns, score
@@ -391,7 +392,7 @@ def evaluate(run: Run, policy: Any, kept: int) -> None:
     """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
-    known = known_returns(run.env)
+    known, place = known_returns(run.env), machine()
     result = {
         **run.settings,
         "trained": run.trained,
@@ -406,7 +407,7 @@ def evaluate(run: Run, policy: Any, kept: int) -> None:
         "evaluation": {"first_seed": FIRST_FRESH_SEED, "episodes": EPISODES, "returns": returns.tolist()},
         "versions": {"python": platform.python_version(), "lag-envs": __version__}
         | {name: version(name) for name in PACKAGES},
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": f"{place['processor']}, {place['cores']} cores",
     }
     write(run.path(RESULT), json.dumps(result, indent=1) + "\n")
     run.path(CHECKPOINT).unlink(missing_ok=True)

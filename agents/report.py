@@ -64,8 +64,9 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         parts.append(
             "How likely a training run of one learner is to end with a better policy than another agent's:"
         )
-        parts.append(_image("agents-improvement.png", "Probability of improvement"))
-        parts.append(_improvement_table(envs))
+        if any(env["improvement"] for env in envs.values()):
+            parts.append(_image("agents-improvement.png", "Probability of improvement"))
+            parts.append(_improvement_table(envs))
     parts += ["## The adapter", adapter()] if ADAPTER.exists() else []
     parts += ["## How it was measured", _method(data), "### Noise", _noise_table(envs)]
     parts += ["### Machine and versions", _about(data)]
@@ -349,8 +350,9 @@ def _about(data: Data) -> str:
     places = sorted({place for agent in agents for place in agent.get("trained_on", ())})
     trained = "\n".join(f"- {place}" for place in places)
     text = (
-        f"Measured on {machine['processor']}, {machine['cores']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {data['date']}. {versions}."
+        f"Last measured on {machine['processor']}, {machine['cores']} cores, {machine['system']}, Python"
+        f" {machine['python']}; {data['date']}. {versions}. Earlier rows stand as they were measured, and seconds"
+        " of training may be of different processors."
     )
     return text + (f"\n\nTrained on:\n\n{trained}" if trained else "")
 

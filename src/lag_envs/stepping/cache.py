@@ -265,9 +265,7 @@ def _rebuild(content: bytes, target: Any) -> Any:
 def _read(path: Path, key: bytes | None) -> bytes | None:
     """Return the content written for a key; None if it cannot be read, `Damaged` if it does not match."""
     try:
-        with open(
-            path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))
-        ) as file:
+        with open(path, "rb", opener=_open_now) as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise Damaged("it is not a regular file")
