@@ -351,8 +351,8 @@ def _about(data: Data) -> str:
     trained = "\n".join(f"- {place}" for place in places)
     text = (
         f"Last measured on {machine['processor']}, {machine['cores']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {data['date']}. {versions}. Earlier rows stand as they were measured, and seconds"
-        " of training may be of different processors."
+        f" {machine['python']}; {data['date']}. {versions}. Earlier rows stand as they were"
+        " measured, and seconds of training may be of different processors."
     )
     return text + (f"\n\nTrained on:\n\n{trained}" if trained else "")
 
