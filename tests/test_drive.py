@@ -319,11 +319,11 @@ GAMEPAD = """() => {
 def test_a_gamepad_drives_and_may_leave(drive):
     page = drive(incline.Tilt.id, hash="#seed=3")
     page.evaluate(GAMEPAD)
-    assert "gamepad is there" in message(page)
+    assert "A gamepad is connected" in message(page)
     page.click(".go")
     shows(page, "φ\u0307", "0.50")
     page.evaluate("window.pad.connected = false")
-    until(page, "document.querySelector('.message').textContent.startsWith('The gamepad has left')")
+    until(page, "document.querySelector('.message').textContent.startsWith('The gamepad is disconnected')")
     assert page.evaluate("document.querySelector('.go').textContent") == "Go on"
     page.focus(".stage")
     page.keyboard.press("Space")
@@ -391,7 +391,7 @@ def test_choices(drive, owned):
 
 def test_nothing_acts(drive, owned):
     page = drive("OwnDrift-v0", folder=owned)
-    assert "Nothing acts here" in message(page)
+    assert "nothing to control here" in message(page)
     page.keyboard.press("Space")
     until(page, "document.querySelector('.message').textContent.startsWith('Time is up')")
 
