@@ -294,9 +294,11 @@ def test_observations_are_read_back(env_id):
     env = gym.make(env_id)
     env.reset(seed=3)
     for _ in range(50):
-        observation, *_ = env.step(env.action_space.sample())
+        observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
         found = read(observation[None])[0]
         np.testing.assert_allclose(found[0], env.unwrapped.state, rtol=1e-6, atol=1e-6)
+        if terminated or truncated:
+            env.reset()
 
 
 @pytest.mark.parametrize("env_id", [id for id, p in solvable().items() if p.targets])

@@ -362,9 +362,9 @@ def test_forms_that_are_broken_are_told():
 def test_batches_with_other_bits_are_told():
     same = [*OWN, *both("RK4", 20.0, 1e-12)]
     claims = work_precision.content(same, []).claims
-    assert next(c for c in claims if c.text.startswith("The batches")).evidence == "2 of 2"
+    assert next(c for c in claims if c.text.startswith("Batches")).evidence == "2 of 2"
     claims = work_precision.content([*same[:-1], same[-1] | {"digest": "else"}], []).claims
-    assert next(c for c in claims if c.text.startswith("The batches")).holds is False
+    assert next(c for c in claims if c.text.startswith("Batches")).holds is False
 
 
 def test_sentences_count_what_the_table_has():
