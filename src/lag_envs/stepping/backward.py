@@ -79,26 +79,27 @@ class Backward(Series):
         tolerance: Any,
         bars: Sequence,
     ) -> tuple[Lane, list, Any]:
-        """Go on with a control step as `substep` does; where that ends it, go back through the substep.
+        """Take a substep like `substep`; in lanes where it ends the control step, also take it backwards.
 
         Parameters
         ----------
         t, inputs, lane, dt, order
             See `substep`.
         tolerance : number
-            What v may leave out. Below 0 the substep was taken before, and is only gone back through: `lane`
-            is as it was, and its wish the length that was certified.
+            Allowed truncation error of v. If negative, the substep was taken before and is only taken
+            backwards: `lane` is its start, and the lane's wish is the certified length.
         bars : sequence of number
             Cotangents of places, then of velocities after the substep, then of the sources.
 
         Returns
         -------
         lane : Lane
-            What it is afterwards.
+            The lane after the substep.
         bars : list of number
-            Cotangents before the substep, those of the sources added up, where it was gone back through.
+            Cotangents before the substep in lanes that went backwards, with those of the sources added up.
         back : condition
-            Whether it was, where the control step has ended. If it has in few of several lanes, it was not.
+            Whether lanes that ended their control step went backwards. They do not if they are only a few of
+            the lanes of a vector.
         """
         zero, again = t.number(0.0), t.less(tolerance, t.number(0.0))
         wanted = t.both(t.negated(again), t.less(zero, lane.left))

@@ -210,23 +210,24 @@ def compile_advance_tangents(
 def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
     """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
 
-    A row of `given` is an entry of state or controls, of `cotangents` one of the state after the step, and of
-    `found`, which is filled in, one of state, controls and parameters before it. How they go together with
-    what the series has is linear: inputs, places and velocities are ``constants + starts @ given``, and
-    `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the cotangents of places, velocities and
-    sources, where `by_end` is that of places and velocities by the state, then `direct`.
+    Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
+    after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
+    has other variables, which depend linearly on these: inputs, places and velocities are
+    ``constants + starts @ given``. `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the
+    cotangents of places, velocities and sources. `by_end` holds the derivatives of places and velocities by
+    the state, followed by `direct`.
 
-    Lanes that are not done are moved together, as in `_rest`. Where a substep ends a step, it is mostly gone
-    back through at once, with the series at hand. The others are written down, round by round, and gone
-    through again afterwards, last round first, side by side too.
+    Unfinished lanes are moved together, as in `_rest`. The substep that ends a step usually goes backwards at
+    once, using the series just expanded. All other substeps are stored, round by round, and go backwards
+    afterwards, last round first, again many lanes together.
     """
     wanted, count = len(pulled), given.shape[1]
     table, before = np.zeros((bounds + wanted, BLOCK)), np.empty((2 * n + 1, BLOCK))
     inputs, bars = np.empty((q, BLOCK)), np.empty((wanted, BLOCK))
     again = np.zeros_like(table)
     rows, rows_again = table.reshape(-1), again.reshape(-1)
-    # Columns of `kept` are substeps: places, velocities, what was left of the step, the length. `lanes` says
-    # whose they are, `rounds` where those of a round end.
+    # Columns of `kept` are substeps: places, velocities, the rest of the step, the substep's length. `lanes`
+    # holds the lane of each column, `rounds` the end of each round's columns.
     kept, lanes = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64)
     rounds, whose = np.empty(64, np.int64), np.empty(BLOCK, np.int64)
     for first in range(0, count, BLOCK):

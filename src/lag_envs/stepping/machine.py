@@ -113,7 +113,7 @@ class Machine:
         return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
 
     def most(self, condition: Any, of: Any) -> ir.Value:
-        """Tell whether a condition holds in two thirds, at least, of the lanes in which another does."""
+        """Tell whether a condition holds in at least two thirds of the lanes in which another holds."""
         kind = ir.IntType(self._lanes)
         count, total = (self._b.zext(self._b.ctpop(self._b.bitcast(x, kind)), _INT) for x in (condition, of))
         three, two = ir.Constant(_INT, 3), ir.Constant(_INT, 2)
@@ -430,8 +430,8 @@ def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> 
     """Return ``pull(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
 
     Rows are `BLOCK` numbers apart: those of `Layout` up to `wish`, then cotangents of places and velocities
-    after the substep, and of the sources. All but inputs are replaced. It returns 1 where lanes that are done
-    have been gone back through, see `Backward.pull`.
+    after the substep, and of the sources. All but the inputs are replaced. It returns 1 if the lanes that
+    ended their step went backwards, see `Backward.pull`.
 
     Parameters
     ----------
