@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import threading
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -122,14 +123,14 @@ def step_blocks(f, ids, par, action, obs, reward, ended, cut, count, at, blocks,
         block, tried = next_block(ids, at, turn, blocks, tried, share, shares)
     hand_in(ids, at, taken, over, refused)
 """
-NO_BAD = "def bad_action(f, action, count):\n    return 0\n"
 
 
 @pytest.fixture(scope="module")
 def toy():
-    """Return `step_all` of environments that count how often their block is stepped."""
+    """Yield `step_all` of environments that count how often their block is stepped."""
     blocks = compile_function("step_blocks", TOY, *sharing.claiming())
-    return sharing.compile_step_all(compile_function("bad_action", NO_BAD), blocks)
+    f, ids, arrays, _ = room(1)
+    yield partial(sharing.compile_step_all(), sharing.address_of(blocks, f, ids, np.zeros(2), *arrays))
 
 
 def room(blocks):
@@ -147,8 +148,8 @@ def test_each_block_is_stepped_once_and_helpers_help(toy):
     helped = set()
     for turn in range(1, 5000):
         rest = (*arrays, count, turn)
-        calls = [(f, ids, pars[i], *rest, i, shares) for i in range(1, shares)]
-        sharing.offer(toy, calls, arrays[0].dtype)
+        calls = [(*toy.args, f, ids, pars[i], *rest, i, shares) for i in range(1, shares)]
+        sharing.offer(calls, arrays[0].dtype)
         while (answer := toy(f, ids, pars[0], *rest, 0, shares))[1] < 0:
             pass
         assert answer == (blocks, blocks)

@@ -32,14 +32,36 @@ def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
     ]
 
 
-def load(at: Callable[[str], str], rows: Sequence[str]) -> list[str]:
-    """Read rows; `at` gives the place of a row."""
-    return [f"{row} = {at(row)}" for row in rows]
+class Rows:
+    """Rows of numbers in an array: the printed place of row r is ``array[first + r * stride]``.
 
+    Parameters
+    ----------
+    names : sequence of str
+        All rows, in their order.
+    array, first, stride : str
+        As printed. Indices are best unsigned: a signed one could be negative, and by NumPy's rules that needs
+        a branch.
+    """
 
-def store(at: Callable[[str], str], rows: Sequence[str]) -> list[str]:
-    """Write rows; `at` gives the place of a row."""
-    return [f"{at(row)} = {row}" for row in rows]
+    def __init__(self, names: Sequence[str], array: str, first: str, stride: str) -> None:
+        self.names, self._array, self._first, self._stride = list(names), array, first, stride
+
+    def at(self, row: str) -> str:
+        """Return the place of a row."""
+        return f"{self._array}[{self._first} + {self.names.index(row)} * {self._stride}]"
+
+    def load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
+        """Return the line that reads rows into variables, by default of their names."""
+        return [f"{', '.join(names or rows)}, = read_rows({self._places(rows)})"] if rows else []
+
+    def store(self, rows: Sequence[str], values: Sequence[str] | None = None) -> list[str]:
+        """Return the line that writes values into rows, by default the variables of their names."""
+        return [f"write_rows({self._places(rows)}, ({', '.join(values or rows)},))"] if rows else []
+
+    def _places(self, rows: Sequence[str]) -> str:
+        numbers = "".join(f"{self.names.index(row)}, " for row in rows)
+        return f"{self._array}, {self._first}, {self._stride}, ({numbers})"
 
 
 def block(head: str, body: Sequence[str]) -> list[str]:

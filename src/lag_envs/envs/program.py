@@ -24,8 +24,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs import sharing
-from lag_envs.envs.lines import block, draw, function, indent, load, next_episode, recorded, store
-from lag_envs.stepping.compiling import BLOCK
+from lag_envs.envs.lines import Rows, block, draw, function, indent, next_episode, recorded
+from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.flows import split
 
 DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
@@ -185,12 +185,11 @@ class Program:
         These are the controls of a step that the fast formula does not cover, or that was refused. The action
         is a number if it has one entry, else an array.
         """
-        at = self._at_one
         body = [
-            *self._constants_one(), *load(at, [*self.y, *self.g, "n"]),
+            *self._constants_one(), *self._one.load([*self.y, *self.g, "n"]),
             *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
-            *self.control, *self.fast, *self._advance_one, *store(at, self.u),
+            *self.control, *self.fast, *self._advance_one, *self._one.store(self.u),
             *self._finish_one(),
         ]  # fmt: skip
         helpers = [self.advance] if self.general else []
@@ -199,8 +198,7 @@ class Program:
     @property
     def _advance_one(self) -> list[str]:
         slow = [
-            *(f"{self._at_one(h)} = {u}" for h, u in zip(self.held, self.u, strict=True)),
-            f"return 0.0, {SLOW}",
+            *self._one.store(self.held, self.u), f"return 0.0, {SLOW}",
         ]
         if not self.general:
             return ["if not within:", *indent(slow)]
@@ -214,7 +212,7 @@ class Program:
     @cached_property
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step after `advance` has filled in the rows ``z``."""
-        rows = load(self._at_one, [*self.y, *self.z, *self.g, *self.u, "n"])
+        rows = self._one.load([*self.y, *self.z, *self.g, *self.u, "n"])
         return function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
 
     @cached_property
@@ -222,9 +220,9 @@ class Program:
         """``start_one(f, obs, ids, state_given, target_given)``: begin an episode, sampling the rest."""
         rows = [*self.y[: self.n_state], *self.g]
         body = [
-            *self._constants_one(), *load(self._at_one, rows),
+            *self._constants_one(), *self._one.load(rows),
             *next_episode("0", "1", "2"), *self._start, *self.observe,
-            *store(self._at_one, [*self.y, *self.g, *self.u, "n", *self.drawn]),
+            *self._one.store([*self.y, *self.g, *self.u, "n", *self.drawn]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
         return function("start_one", "f, obs, ids, state_given, target_given", body)
@@ -259,7 +257,7 @@ class Program:
             "rewards[i] = r", "ended[i] = over > 0.0",
         ]  # fmt: skip
         body = [
-            *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            *self._parameters(),
             *([f"rows = np.zeros({self._stepper.scratch})"] if self.general else []),
             "for i in range(states.shape[0]):", *indent(row),
             "return 0",
@@ -281,20 +279,26 @@ class Program:
         """Numbers that `step_all` needs after the constants."""
         return len(self.scratch) * BLOCK
 
-    def _at_one(self, row: str) -> str:
-        return f"f[{(self.kept + self.scratch).index(row)}]"
+    @property
+    def _one(self) -> Rows:
+        """The rows of a single environment."""
+        constants = [f"k_{name}" for name in self.uniform]
+        return Rows([*self.kept, *self.scratch, *constants], "f", "0", "1")
 
     def _constants_one(self) -> list[str]:
-        first = len(self.kept + self.scratch)
-        uniform = [f"k_{name} = f[{first + j}]" for j, name in enumerate(self.uniform)]
-        return uniform + load(self._at_one, [f"k_{name}" for name in self.varying])
+        return self._one.load([f"k_{name}" for name in self.uniform + self.varying])
+
+    def _parameters(self) -> list[str]:
+        """Return the line that reads the constants of a batch."""
+        names = [f"k_{name}" for name in self.uniform]
+        return Rows(names, "par", "0", "1").load(names)
 
     def _finish_one(self) -> list[str]:
         return [
             *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
             "n = n + 1.0", *(["key = ids[2]"] if self.kick else []), *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
-            *self.observe, *store(self._at_one, [*self.y, "n"]),
+            *self.observe, *self._one.store([*self.y, "n"]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
             "return r, np.int64(over)",
         ]  # fmt: skip
@@ -315,37 +319,33 @@ class Program:
     # --- a batch: blocks of rows ---------------------------------------------------------------------------
 
     @cached_property
-    def step_all(self) -> Callable:
-        """A step of all environments; see `sharing.compile_step_all`."""
-        return sharing.compile_step_all(self.bad_action, self.step_blocks)
-
-    @cached_property
     def step_blocks(self) -> Callable:
         """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
         y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
         lane = "for i in range(size):"
-        inputs = load(_at, [*varying, *y, *self.g, "n"])
+        inputs = self._load([*varying, *y, *self.g, "n"])
         results = ["n", "over", "r", "ordinary", *self.o]
         key = ["key = ids[last + first + i]"] if self.kick else []
-        controls = [*load(_at, self.a), *self.control]
+        controls = [*self._load(self.a), *self.control]
         if self.general:
             rows = dict(zip(self._stepper.rows, self.flow, strict=True))
             # The status of a lane shows that it is to be restarted, not stepped.
             before = [
                 *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
-                *store(_at, self.u), *(f"{_at(rows[name])} = {name}" for name in self._stepper.given),
+                *self._store(self.u),
+                *self._store([rows[name] for name in self._stepper.given], self._stepper.given),
             ]  # fmt: skip
-            after = [f"{name} = {_at(rows[name])}" for name in self._stepper.results]
+            after = self._load([rows[name] for name in self._stepper.results], self._stepper.results)
             start, dt = f"np.int64({len(self.uniform)})", "k_dt"
             call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
             moving = [*block(lane, before), call]
-            move = [*load(_at, self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
-            again = [*load(_at, self.u), *self.fast, *after, *self._stepper.finish]
+            move = [*self._load(self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
+            again = [*self._load(self.u), *self.fast, *after, *self._stepper.finish]
             helpers = [self._stepper.compile_block()]
         else:
             moving, move = [], [*controls, *self.fast]
             call = ", ".join([*y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
-            again = [*load(_at, self.u), f"{', '.join(z)}, status = advance({call})"]
+            again = [*self._load(self.u), f"{', '.join(z)}, status = advance({call})"]
             helpers = [self.advance]
         # If the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
         special = " and not over > 0.0" if self.last else ""
@@ -356,15 +356,15 @@ class Program:
             "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
-            *self.observe, *store(_at, [*y, *([] if self.general else self.u), *results]),
+            *self.observe, *self._store([*y, *([] if self.general else self.u), *results]),
         ]  # fmt: skip
         redo = [
-            f"if {_at('ordinary')} == 0.0:",
+            f"if {self._at('ordinary')} == 0.0:",
             *indent([
                 *inputs, *again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
-                f"    {_at('over')} = 0.0",
+                f"    {self._at('over')} = 0.0",
                 "else:",
                 *indent([
                     *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
@@ -372,28 +372,28 @@ class Program:
                     "if n >= k_limit:", "    over = over + 2.0",
                     *key, *self.kick, *self.move, *self.observe,
                     "if over > 0.0:", "    n = -over",
-                    *store(_at, [*y, "n", "over", "r", *self.o]),
+                    *self._store([*y, "n", "over", "r", *self.o]),
                 ]),
             ]),
         ]  # fmt: skip
         restart = [
-            f"if {_at('ordinary')} == 2.0:",
+            f"if {self._at('ordinary')} == 2.0:",
             *indent([
-                *load(_at, [*varying, *self.g]),
+                *self._load([*varying, *self.g]),
                 *next_episode("first + i", "second + first + i", "last + first + i"),
                 "state_given, target_given = False, False", *self._start, "r = 0.0", "over = 0.0",
                 *self.observe,
-                *store(_at, [*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
+                *self._store([*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
         output = [
-            f"reward[first + i] = {_at('r')}", f"over = {_at('over')}",
+            f"reward[first + i] = {self._at('r')}", f"over = {self._at('over')}",
             "terminated[first + i] = (over == 1.0) | (over == 3.0)", "truncated[first + i] = over >= 2.0",
             "overs += np.uint64(over > 0.0)",
         ]  # fmt: skip
         body = [
             "wide_vectors()",
-            *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            *self._parameters(),
             "second, last = np.uint64(count), np.uint64(2 * count)",
             *self._claimed([
                 self._base,
@@ -401,19 +401,19 @@ class Program:
                 *(
                     line
                     for j, a in enumerate(self.a)
-                    for line in block(lane, [f"{_at(a)} = action[{self._action(j)}]"])
+                    for line in block(lane, [f"{self._at(a)} = action[{self._action(j)}]"])
                 ),
                 *moving,
                 *block(lane, main),
-                *block(lane, [f"slow += {_at('ordinary')} == 0.0", f"restarts += {_at('ordinary')} == 2.0"]),
+                *block(lane, [f"slow += {self._at('ordinary')} == 0.0", f"restarts += {self._at('ordinary')} == 2.0"]),
                 "if slow > 0:", *indent(block(lane, redo)),
                 "if restarts > 0:", *indent(block(lane, restart)),
                 *block(lane, output),
-                # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
-                *(line for entry in _observations(self.o) for line in block(lane, [entry])),
+                f"show(obs, first, size, par, np.uint64({self._shown}))",
             ]),
         ]  # fmt: skip
-        return self._batch("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming())
+        show = compile_python("show", _show, BLOCK=BLOCK)
+        return function("step_blocks", STEP_BLOCKS, body, show, *helpers, *sharing.claiming())
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""
@@ -426,22 +426,10 @@ class Program:
             "hand_in(ids, at, taken, overs, refused)",
         ]  # fmt: skip
 
-    @cached_property
-    def bad_action(self) -> Callable:
-        """``bad_action(f, action, count)`` to -(i + 1) if action i is not finite, or 0."""
-        n = len(self.a)
-        # An environment that is to be restarted ignores its action.
-        place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
-        found = (f"if not (abs(action[i * {n} + {j}]) < math.inf) and f[{place}] >= 0.0:" for j in range(n))
-        body = [
-            "bad = 0",
-            f"for i in range(np.uint64(count) * np.uint64({n})):",
-            "    bad += not (abs(action[i]) < math.inf)",
-            "if bad > 0:",
-            "    for i in range(count):",
-            *indent([line for test in found for line in (test, "    return -(i + 1)")], 2),
-        ]  # fmt: skip
-        return function("bad_action", "f, action, count", [*(body if n else []), "return 0"])
+    @property
+    def _shown(self) -> int:
+        """Where the rows of the observation begin in a batch's working memory."""
+        return len(self.uniform) + self.scratch.index("o0") * BLOCK if self.o else 0
 
     def _action(self, j: int) -> str:
         """Return the place of action j of the current environment in the batch's array."""
@@ -458,36 +446,52 @@ class Program:
         start = [
             "if mask[first + i] or whole:",
             *indent([
-                *load(_at, [*dict.fromkeys([*varying, *self.y, *self.g, *self.u, "n", *self.drawn])]),
+                *self._load([*dict.fromkeys([*varying, *self.y, *self.g, *self.u, "n", *self.drawn])]),
                 "if mask[first + i]:",
                 *indent([
                     *next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
                 ]),
-                *self.observe, *store(_at, [*self.y, *self.g, *self.u, "n", *self.drawn]),
-                *_observations(self.o, "{}"),
+                *self.observe, *self._store([*self.y, *self.g, *self.u, "n", *self.drawn]),
+                *(f"obs[{j}, first + i] = {o}" for j, o in enumerate(self.o)),
             ]),
         ]  # fmt: skip
         body = [
-            *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            *self._parameters(),
             "second, last = np.uint64(count), np.uint64(2 * count)",
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
             *indent([*self._place, self._base, *block("for i in range(size):", start)]),
         ]  # fmt: skip
-        return self._batch(
+        return function(
             "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
         )
 
-    def _batch(self, name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
-        """Compile a function on a batch: kept rows are in `f`, the others after the constants in `par`."""
+    # The rows of the current environment: those kept from step to step, and those needed within one, which
+    # exist once for all blocks.
 
-        def place(match: re.Match) -> str:
-            if match[1] in self.kept:
-                return f"f[base + np.uint64({self.kept.index(match[1]) * BLOCK}) + i]"
-            return f"par[np.uint64({len(self.uniform) + self.scratch.index(match[1]) * BLOCK}) + i]"
+    @property
+    def _kept_rows(self) -> Rows:
+        return Rows(self.kept, "f", "base + i", f"np.uint64({BLOCK})")
 
-        # Indices are unsigned: a signed one could be negative, and by NumPy's rules that needs a branch.
-        lines = [re.sub(r"row_(\w+)\[i\]", place, line) for line in body]
-        return function(name, arguments, lines, *helpers)
+    @property
+    def _scratch_rows(self) -> Rows:
+        return Rows(self.scratch, "par", f"np.uint64({len(self.uniform)}) + i", f"np.uint64({BLOCK})")
+
+    def _at(self, row: str) -> str:
+        return (self._kept_rows if row in self.kept else self._scratch_rows).at(row)
+
+    def _load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
+        """Return the lines that read rows into variables, by default of their names."""
+        return self._each_kind(Rows.load, rows, names)
+
+    def _store(self, rows: Sequence[str], values: Sequence[str] | None = None) -> list[str]:
+        """Return the lines that write rows, by default from variables of their names."""
+        return self._each_kind(Rows.store, rows, values)
+
+    def _each_kind(self, move: Callable, rows: Sequence[str], names: Sequence[str] | None) -> list[str]:
+        pairs = list(zip(rows, names or rows, strict=True))
+        kinds = (self._kept_rows, self._scratch_rows)
+        chosen = ((kind, [pair for pair in pairs if pair[0] in kind.names]) for kind in kinds)
+        return [line for kind, found in chosen if found for line in move(kind, *zip(*found, strict=True))]
 
     @property
     def _place(self) -> list[str]:
@@ -503,11 +507,9 @@ class Program:
         return f"base = block * np.uint64({BLOCK * len(self.kept)})"
 
 
-def _at(row: str) -> str:
-    """Return a row's number in the current environment; `Program._batch` fills in its place."""
-    return f"row_{row}[i]"
-
-
-def _observations(names: Sequence[str], value: str = _at("{}")) -> list[str]:
-    """Put the observation's numbers into the batch's array, one row per entry."""
-    return [f"obs[{j}, first + i] = {value.format(o)}" for j, o in enumerate(names)]
+def _show(obs, first, size, par, at):  # type: ignore[no-untyped-def]
+    """Put a block's observations into the batch's array, one row per entry."""
+    # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
+    for j in range(np.uint64(len(obs))):
+        for i in range(size):
+            obs[j, first + i] = par[at + j * np.uint64(BLOCK) + i]

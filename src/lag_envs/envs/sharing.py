@@ -13,11 +13,14 @@ needed, and ended before a process forks.
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
 import os
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +33,20 @@ SHARE = 4096
 #: How often a thread checks whether another is ready, about 50 µs in total, before it sleeps.
 PATIENCE = 200_000
 #: Numbers that threads share: the turn, unfinished blocks, ended episodes, the refused environment, addresses
-#: of the five arrays of a step, bytes per number of an action. After them come, for each block, the turn in
-#: which it was last claimed, and for each share whether a helper has it.
-WORDS = 10
+#: of the five arrays of a step, bytes per number of an action, numbers per block, and which of them is the
+#: first of the row `n`. After them come, for each block, the turn in which it was last claimed, and for each
+#: share whether a helper has it.
+WORDS = 12
 
 
 def words(blocks: int) -> int:
     """Return how many numbers threads share."""
     return WORDS + 2 * blocks
+
+
+def describe(ids: NDArray[np.uint64], count: int, kept: Sequence[str]) -> None:
+    """Write into a batch's keys where its rows lie."""
+    ids[3 * count + 10 : 3 * count + 12] = len(kept) * BLOCK, kept.index("n") * BLOCK
 
 
 def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
@@ -48,7 +57,9 @@ def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
 # --- compiled ---
 
 
-def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares):  # type: ignore[no-untyped-def]
+def _step_all(  # type: ignore[no-untyped-def]
+    blocks_at, f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares
+):
     """Take part in a turn; see `compile_step_all`."""
     at, now = np.uint64(3 * count), np.uint64(turn)
     blocks = np.uint64((count + BLOCK - 1) // BLOCK)
@@ -62,7 +73,7 @@ def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, tu
             if ids[at + np.uint64(9)] != np.uint64(action.itemsize):
                 break
             step_blocks(
-                f, ids, par,
+                blocks_at, f, ids, par,
                 moved(action, ids[at + np.uint64(4)]),
                 moved(obs, ids[at + np.uint64(5)]),
                 moved(reward, ids[at + np.uint64(6)]),
@@ -76,7 +87,7 @@ def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, tu
     if atomic_load(ids, at) < now:
         if not done(ids, at):
             return 0, -1
-        bad = bad_action(f, action, count)
+        bad = bad_action(f, action, count, ids[at + np.uint64(10)], ids[at + np.uint64(11)])
         if bad < 0:
             return bad, 0
         ids[at + np.uint64(1)] = blocks
@@ -89,12 +100,30 @@ def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, tu
         ids[at + np.uint64(9)] = np.uint64(action.itemsize)
         atomic_store(ids, at, now)
     step_blocks(
-        f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, now,
+        blocks_at, f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, now,
         np.uint64(0), np.uint64(shares),
     )  # fmt: skip
     if not done(ids, at):
         return 0, -1
     return np.int64(ids[at + np.uint64(3)]), np.int64(ids[at + np.uint64(2)])
+
+
+def _bad_action(f, action, count, size, first):  # type: ignore[no-untyped-def]
+    """Return -(i + 1) if action i is not finite, or 0; of a row in `f`, see `describe`.
+
+    An environment that is to be restarted ignores its action.
+    """
+    bad = 0
+    for i in range(np.uint64(len(action))):
+        bad += not abs(action[i]) < math.inf
+    if bad > 0:
+        many = len(action) // count
+        for i in range(count):
+            going = f[np.uint64(i // BLOCK) * size + first + np.uint64(i % BLOCK)] >= 0.0
+            for j in range(i * many, (i + 1) * many):
+                if going and not abs(action[j]) < math.inf:
+                    return -(i + 1)
+    return 0
 
 
 def _next_block(ids, at, turn, blocks, tried, share, shares):  # type: ignore[no-untyped-def]
@@ -150,28 +179,42 @@ def claiming() -> list[Callable]:
     return [_compiled(_next_block), _compiled(_hand_in)]
 
 
-def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
-    """Compile ``step_all(f, ids, par, action, obs, reward, ended, cut, count, turn, share, shares)``.
+@cache
+def compile_step_all() -> Callable:
+    """Compile ``step_all(blocks_at, f, ids, par, action, obs, reward, ended, cut, count, turn, share, shares)``.
 
-    Steps every environment; one whose episode was over is restarted instead. `ended` and `cut` are the arrays
-    of terminations and truncations. `turn` is the number of the step, from 1.
+    Steps every environment; one whose episode was over is restarted instead. `blocks_at` is the `address_of`
+    the loop over the blocks that a thread can claim. `ended` and `cut` are the arrays of terminations and
+    truncations. `turn` is the number of the step, from 1.
 
     The thread with `share` 0 leads, and gets (status, over). The status is 0; or i + 1 if environment i was
     refused and kept its state; or -(i + 1) if action i is not finite, in which case nothing was stepped.
     ``over`` counts the environments whose episode has just ended; it is -1 if helpers are not done yet, and
     then the same call has to be made again. Helpers make this call with another number below `shares` and the
     `par` that belongs to it; they continue with steps that follow soon. Their results mean nothing.
+    """
+    from lag_envs.stepping.primitives import at_address
+
+    step_blocks = at_address("step_blocks", 14)
+    return _compiled(_step_all, step_blocks, *map(_compiled, (_bad_action, _opened, _done)))
+
+
+def address_of(step_blocks: Any, *arrays: NDArray) -> int:
+    """Compile a loop over blocks for these types of arrays, and return where it lies in memory.
 
     Parameters
     ----------
-    bad_action : callable
-        ``bad_action(f, action, count)`` to 0 or -(i + 1).
     step_blocks : callable
-        ``step_blocks(f, ids, par, ..., count, at, blocks, turn, share, shares)``, the loop over the blocks
-        that a thread can claim.
+        ``step_blocks(f, ids, par, ..., count, at, blocks, turn, share, shares)``. The caller keeps it alive.
+    *arrays : ndarray
+        Arrays like those that `step_all` will be called with, from `f` to `cut`.
     """
-    looks = _compiled(_opened), _compiled(_done)
-    return _compiled(_step_all, bad_action, step_blocks, *looks)
+    from numba import typeof, types
+
+    signature = (*map(typeof, arrays), types.int64, *[types.uint64] * 5)
+    step_blocks.compile(signature)
+    compiled = step_blocks.overloads[signature]
+    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))
 
 
 # --- the threads of this process ---
@@ -189,7 +232,7 @@ def default_threads(count: int) -> int:
     return max(1, min(count // SHARE, usable_cores(), int(limit) if limit.isdecimal() else count))
 
 
-def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
+def offer(calls: Sequence[tuple], kind: np.dtype) -> None:
     """Offer calls of `step_all`, one for each of these tuples of arguments, to idle helpers.
 
     Earlier offers for other arguments are withdrawn; those for the same arguments remain valid. `kind` is the
@@ -197,8 +240,8 @@ def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
     be compiling when the process ends.
     """
     global _offered
-    if (step_all, kind) not in _compiled_for:
-        _compiled_for.add((step_all, kind))
+    if kind not in _compiled_for:
+        _compiled_for.add(kind)
         return
     if id(calls) == _offered and _offers.qsize() >= len(calls):
         return
@@ -211,13 +254,14 @@ def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
         _helpers.append(threading.Thread(target=_help, name=f"lag_envs helper {i + 1}", daemon=True))
         _helpers[i].start()
     for arguments in calls:
-        _offers.put((step_all, arguments))
+        _offers.put(arguments)
 
 
 def _help() -> None:
-    while (job := _offers.get()) is not None:
-        job[0](*job[1])
-        del job  # its arrays may be large
+    step_all = compile_step_all()
+    while (arguments := _offers.get()) is not None:
+        step_all(*arguments)
+        del arguments  # its arrays may be large
 
 
 def _dismiss() -> None:
@@ -228,9 +272,9 @@ def _dismiss() -> None:
         _helpers.pop().join()
 
 
-_offers: queue.SimpleQueue[tuple[Callable, tuple] | None] = queue.SimpleQueue()
+_offers: queue.SimpleQueue[tuple | None] = queue.SimpleQueue()
 _offered = 0
 _helpers: list[threading.Thread] = []
-_compiled_for: set[tuple[Callable, np.dtype]] = set()
+_compiled_for: set[np.dtype] = set()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_dismiss)

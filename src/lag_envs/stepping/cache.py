@@ -128,7 +128,7 @@ def jit(function: Callable, key: str | None = None) -> Any:
     """
     import numba
 
-    dispatcher = numba.njit(function, error_model="numpy", nogil=True)
+    dispatcher = numba.njit(function, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
     if key is None:
         with contextlib.suppress(OSError, TypeError):  # typed in, not in a file
             source = inspect.getsource(inspect.getmodule(function))  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from lag_envs.stepping.tracing import BOOLEAN, MAGIC, Operation
@@ -131,6 +132,69 @@ def moved(typingctx, array, address):  # type: ignore[no-untyped-def]
         return made._getvalue()
 
     return array(array, types.uint64), codegen
+
+
+@intrinsic(prefer_literal=True)
+def read_rows(typingctx, array, first, stride, rows):  # type: ignore[no-untyped-def]
+    """Return ``array[first + row * stride]`` for each of these rows, a tuple of literal ints.
+
+    To Numba this is one step, where an expression per row would be a dozen.
+    """
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        numbers = [builder.load(at) for at in _places(context, builder, signature, args)]
+        return context.make_tuple(builder, signature.return_type, numbers)
+
+    return types.UniTuple(types.float64, len(rows))(array, first, stride, rows), codegen
+
+
+@intrinsic(prefer_literal=True)
+def write_rows(typingctx, array, first, stride, rows, numbers):  # type: ignore[no-untyped-def]
+    """Write numbers, a tuple, to the places from which `read_rows` would read them."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        kinds = signature.args[4]
+        for i, at in enumerate(_places(context, builder, signature, args)):
+            number = builder.extract_value(args[4], i)
+            builder.store(context.cast(builder, number, kinds[i], types.float64), at)
+        return context.get_dummy_value()
+
+    return types.void(array, first, stride, rows, numbers), codegen
+
+
+def _places(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequence) -> list[ir.Value]:
+    array, *integers = signature.args[:3]
+    data = context.make_array(array)(context, builder, args[0]).data
+    first, stride = (
+        context.cast(builder, value, kind, types.uint64)
+        for value, kind in zip(args[1:3], integers, strict=True)
+    )
+    return [
+        builder.gep(data, [builder.add(first, builder.mul(_INT(row.literal_value), stride))])
+        for row in signature.args[3]
+    ]
+
+
+def at_address(name: str, arguments: int) -> Callable:
+    """Return ``name(address, *arguments)`` for compiled code, which calls other compiled code at an address.
+
+    What is called returns nothing, and cannot fail.
+    """
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        kind = context.call_conv.get_function_type(types.none, signature.args[1:])
+        # Where Numba's functions put their result, and what went wrong.
+        room = [cgutils.alloca_once(builder, pointer.pointee) for pointer in kind.args[:2]]
+        given = context.get_arg_packer(signature.args[1:]).as_arguments(builder, args[1:])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), [*room, *given])
+        return context.get_dummy_value()
+
+    names = ", ".join(f"a{i}" for i in range(arguments))
+    scope = {"answer": lambda *kinds: (types.void(types.int64, *kinds), codegen)}
+    exec(f"def call(typingctx, address, {names}): return answer({names})", scope)
+    function = intrinsic(scope["call"])
+    function.__name__ = f"{name}_{arguments}"
+    return function
 
 
 @intrinsic
@@ -315,6 +379,8 @@ NAMES = {
     "math": math,
     "fma": fma,
     "select": select,
+    "read_rows": read_rows,
+    "write_rows": write_rows,
     "wide_vectors": wide_vectors,
     "address": address,
     "moved": moved,

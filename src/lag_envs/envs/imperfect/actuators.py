@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs.imperfect.draws import key_of, noise
-from lag_envs.envs.imperfect.rows import Ring, Rows
+from lag_envs.envs.imperfect.rows import Ring, RowsWithRings
 from lag_envs.envs.lines import recorded
 from lag_envs.stepping.flows import split
 from lag_envs.tasks.imperfections import Imperfections
@@ -88,14 +88,14 @@ class Actuators:
         #: From an action to the command.
         self.perturb = [*clip, *noisy, *(clip if noisy else [])]
 
-    def begin(self, rows: Rows) -> list[str]:
+    def begin(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that begin an episode with the command at rest."""
         return [
             *self.at_rest,
             *rows.fill(self.ring, self._sent | {"at": "0.0"}),
         ]
 
-    def send(self, rows: Rows) -> list[str]:
+    def send(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that send a command, if it is delayed."""
         if not self.ring.slots:
             return []
@@ -109,7 +109,7 @@ class Actuators:
             *rows.put(self.ring, self._sent | {"at": late}),
         ]
 
-    def choose(self, rows: Rows) -> list[str]:
+    def choose(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that find the command in force at `t`, and when the next one takes effect.
 
         It is the one sent last among those that have arrived; this piece of the step ends when another does.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lag_envs.envs.imperfect.rows import Rows
+from lag_envs.envs.imperfect.rows import RowsWithRings
 
 
 class Held:
@@ -40,7 +40,7 @@ class Held:
         #: The controls at the end of a piece.
         self.reached = u
 
-    def begin(self, rows: Rows) -> list[str]:
+    def begin(self, rows: RowsWithRings) -> list[str]:
         """Return the lines before a step: none, since controls begin at their commands."""
         return []
 
@@ -89,6 +89,6 @@ class Lagged:
         ]
         self._u = u
 
-    def begin(self, rows: Rows) -> list[str]:
+    def begin(self, rows: RowsWithRings) -> list[str]:
         """Return the lines before a step: controls begin at their previous values."""
         return [f"{reached} = {rows.at(u)}" for reached, u in zip(self.reached, self._u, strict=True)]

@@ -11,9 +11,9 @@ from lag_envs.envs.imperfect.actuators import Actuators
 from lag_envs.envs.imperfect.drawn import DrawnProgram
 from lag_envs.envs.imperfect.motion import Held, Lagged
 from lag_envs.envs.imperfect.pushes import pushes
-from lag_envs.envs.imperfect.rows import Rows
+from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
-from lag_envs.envs.lines import function, indent, load, next_episode, store
+from lag_envs.envs.lines import function, indent, next_episode
 from lag_envs.envs.program import SLOW, STEP_BLOCKS
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.tasks.base import Task
@@ -28,7 +28,7 @@ class ImperfectProgram(DrawnProgram):
     def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
         super().__init__(task, absent, varying)
         self.scratch = [*self.a, *self.o, *self.held]
-        self._where = Rows(self.kept)
+        self._where = RowsWithRings(self.kept)
 
     @property
     def _printed(self) -> list[str]:
@@ -64,10 +64,6 @@ class ImperfectProgram(DrawnProgram):
     # --- one environment, alone or in a batch ---------------------------------------------------------------
 
     @property
-    def _parameters(self) -> list[str]:
-        return [f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)]
-
-    @property
     def _rows_of_constants(self) -> list[str]:
         return [f"k_{name}" for name in self.varying]
 
@@ -79,8 +75,8 @@ class ImperfectProgram(DrawnProgram):
         """
         n_act, rows, actuators, sensors = len(self.a), self._where, self._actuators, self._sensors
         body = [
-            *self._parameters,
-            *load(rows.at, [*self._rows_of_constants, *self.y, *self.g, *actuators.reached, "n"]),
+            *self._parameters(),
+            *rows.load([*self._rows_of_constants, *self.y, *self.g, *actuators.reached, "n"]),
             *(f"a{i} = work[{i}]" for i in range(n_act)),
             *actuators.perturb, *actuators.send(rows), *self._through,
             *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
@@ -88,7 +84,7 @@ class ImperfectProgram(DrawnProgram):
             "if n >= k_limit:", "    over = over + 2.0",
             *sensors.read(rows),
             *(f"work[{n_act + i}] = {rows.at(h)}" for i, h in enumerate(sensors.shown)),
-            *store(rows.at, [*self.y, *actuators.reached, "n"]),
+            *rows.store([*self.y, *actuators.reached, "n"]),
             *(f"{rows.at(u)} = last_{u}" for u in self.u),
             "return r, np.int64(over)",
         ]  # fmt: skip
@@ -141,10 +137,10 @@ class ImperfectProgram(DrawnProgram):
         rows, actuators = self._where, self._actuators
         undrawn = [row for row in self._rows_of_constants if row not in self.drawn]
         body = [
-            *self._parameters,
-            *load(rows.at, [*undrawn, *self.y[: self.n_state], *self.g]),
+            *self._parameters(),
+            *rows.load([*undrawn, *self.y[: self.n_state], *self.g]),
             *self._start, *actuators.begin(rows), *self._sensors.begin(rows),
-            *store(rows.at, [*self.y, *self.g, *self.u, *actuators.reached, "n", *self.drawn]),
+            *rows.store([*self.y, *self.g, *self.u, *actuators.reached, "n", *self.drawn]),
         ]  # fmt: skip
         return function("launch", "f, base, stride, par, key, state_given, target_given", body)
 

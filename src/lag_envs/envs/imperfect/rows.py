@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from lag_envs.envs.lines import Rows
+
 
 class Ring(NamedTuple):
     """Rows that are stored several times, in slots that are used in turn."""
@@ -18,8 +20,8 @@ class Ring(NamedTuple):
         return [f"{row}_{slot}" for slot in range(self.slots) for row in self.rows]
 
 
-class Rows:
-    """The places of rows.
+class RowsWithRings(Rows):
+    """Rows of one environment, some of them in rings.
 
     Parameters
     ----------
@@ -28,15 +30,11 @@ class Rows:
     """
 
     def __init__(self, kept: Sequence[str]) -> None:
-        self._kept = list(kept)
-
-    def at(self, row: str) -> str:
-        """Return the place of a row."""
-        return f"f[base + {self._kept.index(row)} * stride]"
+        super().__init__(kept, "f", "base", "stride")
 
     def in_slot(self, ring: Ring, row: str) -> str:
         """Return the place of a row of a ring, in the slot numbered ``slot``."""
-        first = self._kept.index(f"{row}_0")
+        first = self.names.index(f"{row}_0")
         return f"f[base + ({first} + slot * {len(ring.rows)}) * stride]"
 
     def put(self, ring: Ring, values: Mapping[str, str]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lag_envs.envs.imperfect.draws import noise
-from lag_envs.envs.imperfect.rows import Ring, Rows
+from lag_envs.envs.imperfect.rows import Ring, RowsWithRings
 from lag_envs.envs.lines import indent
 from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks.imperfections import Imperfections
@@ -54,11 +54,11 @@ class Sensors:
         seen = [*self._observe, *(f"m{i} = {o}" for i, o in enumerate(self._o))]
         return ["if t == k_shown_at:", *indent(seen)]
 
-    def begin(self, rows: Rows) -> list[str]:
+    def begin(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that show a start as if it had lasted for a long time."""
         return [*self._observe, *rows.fill(self.ring, self._seen), *self.sense, *self._show(rows)]
 
-    def read(self, rows: Rows) -> list[str]:
+    def read(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that show the observation at the end of a step."""
         lines, found = [*self._observe], self._options
         if found.readings:
@@ -74,5 +74,5 @@ class Sensors:
             return [*lines, f"if np.int64(n) % np.int64({self._every}) == 0:", *indent(show)]
         return [*lines, *show]
 
-    def _show(self, rows: Rows) -> list[str]:
+    def _show(self, rows: RowsWithRings) -> list[str]:
         return [f"{rows.at(h)} = {o}" for h, o in zip(self.shown, self._o, strict=True)]
