@@ -33,23 +33,27 @@ def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
 
 
 class Rows:
-    """Rows of numbers in an array: the printed place of row r is ``array[first + r * stride]``.
+    """Rows of numbers in an array: row r lies at ``array[first + r * stride]``.
 
     Parameters
     ----------
     names : sequence of str
         All rows, in their order.
-    array, first, stride : str
-        As printed. Indices are best unsigned: a signed one could be negative, and by NumPy's rules that needs
-        a branch.
+    array, first : str
+        As printed.
+    stride : int or str
+        A number, if it is known; then indices are unsigned. (A signed one could be negative, and by NumPy's
+        rules that needs a branch.)
     """
 
-    def __init__(self, names: Sequence[str], array: str, first: str, stride: str) -> None:
+    def __init__(self, names: Sequence[str], array: str, first: str, stride: int | str) -> None:
         self.names, self._array, self._first, self._stride = list(names), array, first, stride
 
     def at(self, row: str) -> str:
         """Return the place of a row."""
-        return f"{self._array}[{self._first} + {self.names.index(row)} * {self._stride}]"
+        r, stride = self.names.index(row), self._stride
+        beyond = f"np.uint64({r * stride})" if isinstance(stride, int) else f"{r} * {stride}"
+        return f"{self._array}[{self._first} + {beyond}]"
 
     def load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
         """Return the line that reads rows into variables, by default of their names."""

@@ -25,7 +25,7 @@ from typing import Any
 
 from lag_envs.envs import sharing
 from lag_envs.envs.lines import Rows, block, draw, function, indent, next_episode, recorded
-from lag_envs.stepping.compiling import BLOCK, compile_python
+from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.flows import split
 
 DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
@@ -198,7 +198,8 @@ class Program:
     @property
     def _advance_one(self) -> list[str]:
         slow = [
-            *self._one.store(self.held, self.u), f"return 0.0, {SLOW}",
+            *self._one.store(self.held, self.u),
+            f"return 0.0, {SLOW}",
         ]
         if not self.general:
             return ["if not within:", *indent(slow)]
@@ -283,7 +284,7 @@ class Program:
     def _one(self) -> Rows:
         """The rows of a single environment."""
         constants = [f"k_{name}" for name in self.uniform]
-        return Rows([*self.kept, *self.scratch, *constants], "f", "0", "1")
+        return Rows([*self.kept, *self.scratch, *constants], "f", "0", 1)
 
     def _constants_one(self) -> list[str]:
         return self._one.load([f"k_{name}" for name in self.uniform + self.varying])
@@ -291,7 +292,7 @@ class Program:
     def _parameters(self) -> list[str]:
         """Return the line that reads the constants of a batch."""
         names = [f"k_{name}" for name in self.uniform]
-        return Rows(names, "par", "0", "1").load(names)
+        return Rows(names, "par", "0", 1).load(names)
 
     def _finish_one(self) -> list[str]:
         return [
@@ -409,11 +410,11 @@ class Program:
                 "if slow > 0:", *indent(block(lane, redo)),
                 "if restarts > 0:", *indent(block(lane, restart)),
                 *block(lane, output),
-                f"show(obs, first, size, par, np.uint64({self._shown}))",
+                # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
+                *(line for entry in self._shown for line in block(lane, [entry])),
             ]),
         ]  # fmt: skip
-        show = compile_python("show", _show, BLOCK=BLOCK)
-        return function("step_blocks", STEP_BLOCKS, body, show, *helpers, *sharing.claiming())
+        return function("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming())
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""
@@ -427,9 +428,9 @@ class Program:
         ]  # fmt: skip
 
     @property
-    def _shown(self) -> int:
-        """Where the rows of the observation begin in a batch's working memory."""
-        return len(self.uniform) + self.scratch.index("o0") * BLOCK if self.o else 0
+    def _shown(self) -> list[str]:
+        """The lines that put the observation into the batch's array, one row per entry."""
+        return [f"obs[{j}, first + i] = {self._at(o)}" for j, o in enumerate(self.o)]
 
     def _action(self, j: int) -> str:
         """Return the place of action j of the current environment in the batch's array."""
@@ -461,20 +462,18 @@ class Program:
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
             *indent([*self._place, self._base, *block("for i in range(size):", start)]),
         ]  # fmt: skip
-        return function(
-            "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
-        )
+        return function("start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body)
 
     # The rows of the current environment: those kept from step to step, and those needed within one, which
     # exist once for all blocks.
 
     @property
     def _kept_rows(self) -> Rows:
-        return Rows(self.kept, "f", "base + i", f"np.uint64({BLOCK})")
+        return Rows(self.kept, "f", "base + i", BLOCK)
 
     @property
     def _scratch_rows(self) -> Rows:
-        return Rows(self.scratch, "par", f"np.uint64({len(self.uniform)}) + i", f"np.uint64({BLOCK})")
+        return Rows(self.scratch, "par", f"np.uint64({len(self.uniform)}) + i", BLOCK)
 
     def _at(self, row: str) -> str:
         return (self._kept_rows if row in self.kept else self._scratch_rows).at(row)
@@ -505,11 +504,3 @@ class Program:
     def _base(self) -> str:
         """The line that says where the rows of a block begin."""
         return f"base = block * np.uint64({BLOCK * len(self.kept)})"
-
-
-def _show(obs, first, size, par, at):  # type: ignore[no-untyped-def]
-    """Put a block's observations into the batch's array, one row per entry."""
-    # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
-    for j in range(np.uint64(len(obs))):
-        for i in range(size):
-            obs[j, first + i] = par[at + j * np.uint64(BLOCK) + i]

@@ -172,8 +172,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
         self._step_all = sharing.compile_step_all()
-        #: Where the program's loops over blocks lie in memory, by the type of actions.
-        self._blocks_at: dict[np.dtype, int] = {}
+        #: Type of the last actions, and where the loop over blocks for this type lies in memory.
+        self._kind: np.dtype | None = None
+        self._blocks_at = 0
         #: Arguments of the calls that helpers are offered, by their number and the type of actions.
         self._calls: dict[tuple[int, np.dtype], list[tuple]] = {}
 
@@ -282,13 +283,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         observations = np.empty((len(program.o), n), FLOAT32)
         rewards, terminations, truncations = np.empty(n), np.empty(n, BOOL), np.empty(n, BOOL)
         arrays = (actions, observations, rewards, terminations, truncations)
-        if (blocks_at := self._blocks_at.get(actions.dtype)) is None:
+        if actions.dtype is not self._kind:
             every = (self._memory, self._ids, self._pars[0], *arrays)
-            blocks_at = self._blocks_at[actions.dtype] = sharing.address_of(program.step_blocks, *every)
+            self._kind, self._blocks_at = actions.dtype, sharing.address_of(program.step_blocks, *every)
         turn = self._turn = self._turn + 1
         rest = (*arrays, n, turn)
-        shares = self._get_help(blocks_at, *rest) if self._most_threads > 1 else 1
-        call = (blocks_at, self._memory, self._ids, self._pars[0], *rest, 0, shares)
+        shares = self._get_help(*rest) if self._most_threads > 1 else 1
+        call = (self._blocks_at, self._memory, self._ids, self._pars[0], *rest, 0, shares)
         status, over = self._step_all(*call)
         while over < 0:  # another program took a helper's core for a while
             time.sleep(1e-5)
@@ -521,14 +522,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._memory, self._ids, self._pars[0], observations.T, mask, *given, self.num_envs
         )
 
-    def _get_help(self, blocks_at: int, actions: NDArray, *rest: Any) -> int:
+    def _get_help(self, actions: NDArray, *rest: Any) -> int:
         """Ask other threads to take part in a step; return how many may take part, including this one."""
         shares, kind = min(self.num_threads, self._most_threads), actions.dtype
         if (calls := self._calls.get((shares, kind))) is None:
             while len(self._pars) < shares:
                 self._pars.append(on_a_line(self._pars[0], len(self._program.uniform)))
             calls = self._calls[shares, kind] = [
-                (blocks_at, self._memory, self._ids, self._pars[i], actions, *rest, i, shares)
+                (self._blocks_at, self._memory, self._ids, self._pars[i], actions, *rest, i, shares)
                 for i in range(1, shares)
             ]
         if calls:
@@ -598,7 +599,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions, pictures, and the helpers' data."""
-        without = ("_program", "_viewers", "_viewed", "_row", "_step_all", "_blocks_at", "_calls")
+        without = ("_program", "_viewers", "_viewed", "_row", "_step_all", "_kind", "_blocks_at", "_calls")
         return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

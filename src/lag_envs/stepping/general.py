@@ -537,17 +537,15 @@ class StepCode:
         from lag_envs.stepping.driver import compile_advance
         from lag_envs.stepping.machine import Layout
 
-        layout = Layout(self.record)
-        n = self._n
+        layout, n = Layout(self.record), range(self._n)
+        moved = [*(f"q{i}" for i in n), *(f"v{i}" for i in n)]
+        given = [*self._inputs, *moved]
         body = [
             f"def advance({self.arguments}):",
             *self.prepare,
-            *(f"rows[{i}] = {name}" for i, name in enumerate(self._inputs)),
-            *(f"rows[{layout.q + i}] = q{i}" for i in range(n)),
-            *(f"rows[{layout.v + i}] = v{i}" for i in range(n)),
+            f"write_rows(rows, 0, 1, {tuple(range(len(given)))}, ({', '.join(given)},))",
             "status = advance_lane(rows, dt, np.int64(order))",
-            *(f"q{i} = rows[{layout.q + i}]" for i in range(n)),
-            *(f"v{i} = rows[{layout.v + i}]" for i in range(n)),
+            f"{', '.join(moved)}, = read_rows(rows, 0, 1, {tuple(range(layout.q, layout.status))})",
             *self.finish,
             f"return {', '.join([*self.end, *self.applied])}, status",
         ]
