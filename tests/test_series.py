@@ -405,8 +405,16 @@ def in_python(name, source, *helpers, **constants):
 
         return run
 
+    def read_rows(array, first, stride, rows):
+        return tuple(array[first + row * stride] for row in rows)
+
+    def write_rows(array, first, stride, rows, numbers):
+        for row, number in zip(rows, numbers, strict=True):
+            array[first + row * stride] = number
+
     numpy = types.SimpleNamespace(zeros=lambda n: [0.0] * n, int64=int)
-    scope = {"np": numpy, **constants, **{helper.__name__: helper for helper in helpers}}
+    scope = {"np": numpy, "read_rows": read_rows, "write_rows": write_rows}
+    scope |= constants | {helper.__name__: helper for helper in helpers}
     scope |= {name: block(*parts) for name, parts in compiling._blocks.items()}
     exec(source, scope)
     return scope[name]

@@ -78,6 +78,9 @@ def indent(lines: Sequence[str], levels: int = 1) -> list[str]:
     return ["    " * levels + line for line in lines]
 
 
-def function(name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
-    """Compile a function of these lines."""
-    return compile_function(name, "\n".join([f"def {name}({arguments}):", *indent(body), ""]), *helpers)
+def function(
+    name: str, arguments: str, body: Sequence[str], *helpers: Callable, inner: bool = False
+) -> Callable:
+    """Compile a function of these lines; see `compile_function`."""
+    source = "\n".join([f"def {name}({arguments}):", *indent(body), ""])
+    return compile_function(name, source, *helpers, inner=inner)

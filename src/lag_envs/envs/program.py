@@ -192,7 +192,7 @@ class Program:
             *self.control, *self.fast, *self._advance_one, *self._one.store(self.u),
             *self._finish_one(),
         ]  # fmt: skip
-        helpers = [self.advance] if self.general else []
+        helpers = [self._stepper.engine()] if self.general else []
         return function("step_one", "f, obs, a, ids", body, *helpers)
 
     @property
@@ -203,10 +203,9 @@ class Program:
         ]
         if not self.general:
             return ["if not within:", *indent(slow)]
-        call = ", ".join([*self.y, *self.u, "dt", str(self._x), *self._stepper.constants])
         first = len(self.kept + self.scratch) + len(self.uniform)
         return [
-            f"{', '.join(self.z)}, status = advance(f[{first}:], {call})",
+            f"rows, order = f[{first}:], {self._x}", *self._stepper.any_step,
             "if status < 0:", *indent(slow),
         ]  # fmt: skip
 
@@ -245,14 +244,14 @@ class Program:
         Returns 0, or i + 1 if the step of row i was refused.
         """
         n = self.n_state
-        call = ", ".join([*self._rows, *self.y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
-        step = [f"{', '.join(self.z)}, status = advance({call})", "if status < 0:", "    return i + 1"]
+        step = [*self._stepper.any_step, "if status < 0:", "    return i + 1"]
+        slow = ["if not within:", f"    x = {self._x}", *indent(step)]
         row = [
             *(f"y{j} = states[i, {j}]" for j in range(n)), *self.lift,
             *(f"{a} = actions[i, {j}]" for j, a in enumerate(self.a)),
             *(f"{g} = targets[i, {j}]" for j, g in enumerate(self.g)),
             *self.control, *self.fast,
-            *(step if self.general else ["if not within:", *indent(step)]),
+            *([f"order = {self._x}", *step] if self.general else slow),
             *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
             *(f"ends[i, {j}] = z{j}" for j in range(n)),
             "rewards[i] = r", "ended[i] = over > 0.0",
@@ -263,12 +262,8 @@ class Program:
             "for i in range(states.shape[0]):", *indent(row),
             "return 0",
         ]  # fmt: skip
-        return function("model", "states, actions, targets, par, ends, rewards, ended", body, self.advance)
-
-    @property
-    def _rows(self) -> list[str]:
-        """The argument that the series' `advance` takes before the others."""
-        return ["rows"] if self.general else []
+        arguments = "states, actions, targets, par, ends, rewards, ended"
+        return function("model", arguments, body, self._stepper.engine())
 
     @property
     def room(self) -> int:
@@ -322,8 +317,8 @@ class Program:
     @cached_property
     def step_blocks(self) -> Callable:
         """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
-        y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
-        lane = "for i in range(size):"
+        y, varying = self.y, [f"k_{name}" for name in self.varying]
+        lane, ordinary = "for i in range(size):", self._at("ordinary")
         inputs = self._load([*varying, *y, *self.g, "n"])
         results = ["n", "over", "r", "ordinary", *self.o]
         key = ["key = ids[last + first + i]"] if self.kick else []
@@ -345,9 +340,8 @@ class Program:
             helpers = [self._stepper.compile_block()]
         else:
             moving, move = [], [*controls, *self.fast]
-            call = ", ".join([*y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
-            again = [*self._load(self.u), f"{', '.join(z)}, status = advance({call})"]
-            helpers = [self.advance]
+            again = [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
+            helpers = [self._stepper.engine()]
         # If the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
         special = " and not over > 0.0" if self.last else ""
         main = [
@@ -360,7 +354,7 @@ class Program:
             *self.observe, *self._store([*y, *([] if self.general else self.u), *results]),
         ]  # fmt: skip
         redo = [
-            f"if {self._at('ordinary')} == 0.0:",
+            f"if {ordinary} == 0.0:",
             *indent([
                 *inputs, *again,
                 "if status < 0:",
@@ -378,7 +372,7 @@ class Program:
             ]),
         ]  # fmt: skip
         restart = [
-            f"if {self._at('ordinary')} == 2.0:",
+            f"if {ordinary} == 2.0:",
             *indent([
                 *self._load([*varying, *self.g]),
                 *next_episode("first + i", "second + first + i", "last + first + i"),
@@ -406,7 +400,7 @@ class Program:
                 ),
                 *moving,
                 *block(lane, main),
-                *block(lane, [f"slow += {self._at('ordinary')} == 0.0", f"restarts += {self._at('ordinary')} == 2.0"]),
+                *block(lane, [f"slow += {ordinary} == 0.0", f"restarts += {ordinary} == 2.0"]),
                 "if slow > 0:", *indent(block(lane, redo)),
                 "if restarts > 0:", *indent(block(lane, restart)),
                 *block(lane, output),
@@ -414,7 +408,7 @@ class Program:
                 *(line for entry in self._shown for line in block(lane, [entry])),
             ]),
         ]  # fmt: skip
-        return function("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming())
+        return function("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming(), inner=True)
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""

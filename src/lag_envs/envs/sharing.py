@@ -171,7 +171,7 @@ def _done(ids, at):  # type: ignore[no-untyped-def]
 
 def _compiled(function: Callable, *helpers: Callable) -> Callable:
     numbers = {"BLOCK": BLOCK, "WORDS": WORDS, "PATIENCE": PATIENCE}
-    return compile_python(function.__name__[1:], function, *helpers, **numbers)
+    return compile_python(function.__name__[1:], function, *helpers, inner=not helpers, **numbers)
 
 
 def claiming() -> list[Callable]:
@@ -181,9 +181,9 @@ def claiming() -> list[Callable]:
 
 @cache
 def compile_step_all() -> Callable:
-    """Compile ``step_all(blocks_at, f, ids, par, action, obs, reward, ended, cut, count, turn, share, shares)``.
+    """Compile ``step_all(blocks_at, f, ids, par, action, obs, reward, ended, cut, count, turn, share, ...)``.
 
-    Steps every environment; one whose episode was over is restarted instead. `blocks_at` is the `address_of`
+    The last argument is `shares`. Steps every environment; one whose episode was over is restarted instead. `blocks_at` is the `address_of`
     the loop over the blocks that a thread can claim. `ended` and `cut` are the arrays of terminations and
     truncations. `turn` is the number of the step, from 1.
 

@@ -109,7 +109,7 @@ def writable(place: Path) -> bool:
         return False
 
 
-def jit(function: Callable, key: str | None = None) -> Any:
+def jit(function: Callable, key: str | None = None, inner: bool = False) -> Any:
     """Compile a function on its first call for each combination of types, or take it from the cache.
 
     Parameters
@@ -120,6 +120,8 @@ def jit(function: Callable, key: str | None = None) -> Any:
         What the result depends on: its own source, and all functions and numbers that it uses. By default the
         file that defines the function, and the numbers that it uses. Types, machine, and the versions of
         Python and Numba are added.
+    inner : bool, default False
+        Whether only compiled code calls it: it is then made without the code that takes Python's objects.
 
     Returns
     -------
@@ -128,7 +130,8 @@ def jit(function: Callable, key: str | None = None) -> Any:
     """
     import numba
 
-    dispatcher = numba.njit(function, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
+    without = {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner}
+    dispatcher = numba.njit(function, error_model="numpy", nogil=True, **without)
     if key is None:
         with contextlib.suppress(OSError, TypeError):  # typed in, not in a file
             source = inspect.getsource(inspect.getmodule(function))  # type: ignore[arg-type]

@@ -57,7 +57,7 @@ def count_operations(lines: Iterable[str], kinds: frozenset[str] | None = None) 
 
 @cache
 def compile_function(
-    name: str, source: str, /, *helpers: Callable, **constants: float | tuple[int, ...]
+    name: str, source: str, /, *helpers: Callable, inner: bool = False, **constants: float | tuple[int, ...]
 ) -> Callable:
     """Compile the function ``name`` that ``source`` defines.
 
@@ -70,6 +70,8 @@ def compile_function(
         and the constants.
     *helpers : callable
         Functions that the source calls, under their names there, as compiled by this function.
+    inner : bool, default False
+        Whether only compiled code calls it, which saves compiling what Python would need.
     **constants : float or tuple of int
         Constants in the source.
 
@@ -89,7 +91,7 @@ def compile_function(
     parts = [
         inspect.getsource(primitives),
         source,
-        repr(sorted(constants.items())),
+        repr((sorted(constants.items()), inner)),
         *(h.__name__ for h in helpers),
     ]
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
@@ -99,15 +101,19 @@ def compile_function(
     namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}
     namespace |= {block: primitives.block(*_blocks[block]) for block in re.findall(_BLOCK, source)}
     exec(code, namespace)
-    return jit(namespace[unique], unique)
+    return jit(namespace[unique], unique, inner)
 
 
 def compile_python(
-    name: str, function: Callable, *helpers: Callable, **constants: float | tuple[int, ...]
+    name: str,
+    function: Callable,
+    *helpers: Callable,
+    inner: bool = False,
+    **constants: float | tuple[int, ...],
 ) -> Callable:
     """Compile a function written in Python under a name; otherwise like `compile_function`."""
     source = inspect.getsource(function).replace(f"def {function.__name__}(", f"def {name}(", 1)
-    return compile_function(name, source, *helpers, **constants)
+    return compile_function(name, source, *helpers, inner=inner, **constants)
 
 
 def compile_traced(

@@ -232,8 +232,10 @@ class Stepper:
         #: Names of the flow's coefficients, and whether each is in the code.
         self.terms = dict(zip(flow.coefficients._fields, present, strict=True))
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
-        self._any = [*prepared, call, *finished]
-        self._flow = lambda: flow.compile(present)
+        #: The lines of any step.
+        self.any_step = [*prepared, call, *finished]
+        #: Returns the function that these lines call.
+        self.engine = lambda: flow.compile(present)
         self._tangent = lambda by: flow.compile_tangent(present, by)
         self._given, self._prepare, self._finish, self._form = given, prepare, finish, form
         self._names = [f"k_{name}" for name in constants]
@@ -253,8 +255,8 @@ class Stepper:
 
         It takes any step. The status is the number of substeps, or negative if the step is refused.
         """
-        body = [f"def advance({self.arguments}):", *self._any, f"return {', '.join(self.end)}, status"]
-        return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
+        body = [f"def advance({self.arguments}):", *self.any_step, f"return {', '.join(self.end)}, status"]
+        return compile_function("advance", "\n    ".join(body) + "\n", self.engine())
 
     @cache  # noqa: B019 - steppers are kept anyway
     def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...] = ()) -> Callable:
@@ -390,9 +392,10 @@ class Stepper:
         load += lift_lines(n, self._angle, "y")
         loop = [
             *(f"{u} = controls[i, {j}]" for j, u in enumerate(self.controls)),
-            f"{', '.join(self.start)}, status = advance({self.arguments})",
+            *self.any_step,
             "if status < 0:",
             "    return i + 1",
+            *(f"{y} = {z}" for y, z in zip(self.start, self.end, strict=True)),
             *(f"trajectory[i + 1, {i}] = y{i}" for i in range(n)),
         ]
         extra = "".join(f", {name}" for name in self.constants)
@@ -403,4 +406,4 @@ class Stepper:
             *("    " + line for line in loop),
             "return 0",
         ]
-        return compile_function("simulate", "\n    ".join(body) + "\n", self.compile())
+        return compile_function("simulate", "\n    ".join(body) + "\n", self.engine())

@@ -534,23 +534,31 @@ class StepCode:
         The status is the number of attempts, or negative if the step is refused. The sums of the substeps'
         bounds on places and velocities are left at the end of `rows`, which has `scratch` numbers.
         """
-        from lag_envs.stepping.driver import compile_advance
+        results = ", ".join([*self.end, *self.applied, "status"])
+        body = [f"def advance({self.arguments}):", *self.any_step, f"return {results}"]
+        return compile_function("advance", "\n    ".join(body) + "\n", self.engine(tolerance))
+
+    @property
+    def any_step(self) -> list[str]:
+        """The lines of any step, from ``y``, ``u``, ``dt``, ``order`` to ``z``, `applied`, ``status``."""
         from lag_envs.stepping.machine import Layout
 
         layout, n = Layout(self.record), range(self._n)
         moved = [*(f"q{i}" for i in n), *(f"v{i}" for i in n)]
         given = [*self._inputs, *moved]
-        body = [
-            f"def advance({self.arguments}):",
+        return [
             *self.prepare,
             f"write_rows(rows, 0, 1, {tuple(range(len(given)))}, ({', '.join(given)},))",
             "status = advance_lane(rows, dt, np.int64(order))",
             f"{', '.join(moved)}, = read_rows(rows, 0, 1, {tuple(range(layout.q, layout.status))})",
             *self.finish,
-            f"return {', '.join([*self.end, *self.applied])}, status",
         ]
-        helper = compile_advance(self.record, tolerance, self._fused)
-        return compile_function("advance", "\n    ".join(body) + "\n", helper)
+
+    def engine(self, tolerance: float = TOLERANCE) -> Callable:
+        """Return the function that the lines of `any_step` call."""
+        from lag_envs.stepping.driver import compile_advance
+
+        return compile_advance(self.record, tolerance, self._fused)
 
     def bounded(
         self,
@@ -591,12 +599,16 @@ class StepCode:
         reached = [name.removesuffix("_end") for name in self.applied if name.endswith("_end")]
         carried = [*self.start, *reached]
         given = [name for name in self.controls if name not in reached]
+        ends = [*self.end, *self.applied[: len(reached)]]
         loop = [
             *(f"{u} = controls[i, {j}]" for j, u in enumerate(given)),
-            f"{', '.join([*carried, *self.applied[len(reached) :]])}, status = advance({self.arguments})",
+            *self.any_step,
             "if status < 0:",
             "    return i + 1",
-            *(f"trajectory[i + 1, {i}] = {y}" for i, y in enumerate(carried)),
+            *(
+                f"{y} = trajectory[i + 1, {i}] = {z}"
+                for i, (y, z) in enumerate(zip(carried, ends, strict=True))
+            ),
         ]
         body = [
             f"def simulate(trajectory, controls, dt, order{extra}):",
@@ -606,7 +618,7 @@ class StepCode:
             *("    " + line for line in loop),
             "return 0",
         ]
-        return compile_function("simulate", "\n    ".join(body) + "\n", self.compile(tolerance))
+        return compile_function("simulate", "\n    ".join(body) + "\n", self.engine(tolerance))
 
 
 _steppers: dict[str, SeriesStepper] = {}

@@ -279,7 +279,7 @@ def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
 
     short = name.rsplit("_", 1)[0]
     source = f"def hold({arguments}):\n    return {short}({arguments})\n"
-    holder: Any = compile_function("hold", source, called(lambda module: write(module, name)))
+    holder: Any = compile_function("hold", source, called(lambda module: write(module, name)), inner=True)
     holder.compile((types.float64[::1], types.int64, *rest))
     function: Any = called(lambda module: ir.Function(module, kind, name))
     function.holder = holder  # keeps the code in memory

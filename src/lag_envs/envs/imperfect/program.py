@@ -225,7 +225,8 @@ class ImperfectProgram(DrawnProgram):
                 *self._show,
             ])),
         ]  # fmt: skip
-        return function("step_blocks", STEP_BLOCKS, body, self.take, self.launch, *sharing.claiming())
+        helpers = self.take, self.launch, *sharing.claiming()
+        return function("step_blocks", STEP_BLOCKS, body, *helpers, inner=True)
 
     def _at_lane(self, row: str) -> str:
         return f"f[base + {self.kept.index(row) * BLOCK}]"
