@@ -140,9 +140,7 @@ def error_of(id):
     return policy_error(reference, BOARD.result(entry)["policies"])
 
 
-QUICK = (
-    f"{incline.Brake.id}-ppo", f"{cylinder_in_cylinder.Tilt.id}-ppo", f"{cylinder_in_cylinder.Pump.id}-td3",
-)  # fmt: skip
+QUICK = (f"{incline.Brake.id}-ppo", f"{cylinder_in_cylinder.Pump.id}-td3")
 
 
 @pytest.mark.parametrize(

@@ -272,6 +272,7 @@ def test_cold_start_shows_where_the_time_goes(tmp_path, capsys):
     assert all(stage > 0.0 for stage in stages)
 
 
+@pytest.mark.slow
 def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     some = partial(jacobians.jacobians, names=("Incline", "CartPole"))
     monkeypatch.setattr(measurement, "jacobians", some)

@@ -194,7 +194,13 @@ def starts(task, rng, n):
     return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
 
 
-@pytest.mark.parametrize("env_id", covering(SMOOTH, of=engine))
+def way(kind):
+    """Return how a task's step is differentiated."""
+    found = "imperfect" if kind.imperfections else "closed form" if kind().scene._form else "series"
+    return frozenset([found])
+
+
+@pytest.mark.parametrize("env_id", covering(SMOOTH, of=way))
 def test_whole_step(env_id):
     """Along a random direction of state, actions and parameters, at starts and where guards and clips act."""
     task, rng, n = TASKS[env_id](), seeded(env_id), 3

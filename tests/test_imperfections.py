@@ -155,7 +155,9 @@ def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch
     import lag_envs.envs.lines as module
 
     printed: list[str] = []
-    monkeypatch.setattr(module, "compile_function", lambda name, source, *rest: printed.append(source))
+    monkeypatch.setattr(
+        module, "compile_function", lambda name, source, *_, **options: printed.append(source)
+    )
     task = make_task(ID)
     program = Program(task, frozenset(n for n, x in constants_of(task).items() if x == 0.0))
     _ = program.step_one, program.start_one, program.start_all, program.finish_one

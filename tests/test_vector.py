@@ -10,7 +10,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering, engine, quick, slow
+from covering import covering, engine, features, quick, slow
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -25,6 +25,15 @@ each_engine = pytest.mark.parametrize("env_id", covering(of=engine))
 each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
+
+
+def in_every_mode(of=features):
+    """Quick are a covering set with the first mode, and one environment with every mode."""
+    chosen = quick(of=of)
+    fast = {(chosen[0], mode) for mode in MODES} | {(i, MODES[0]) for i in chosen}
+    pairs = [(i, mode) for mode in MODES for i in TASKS]
+    values = [pair if pair in fast else slow(*pair) for pair in pairs]
+    return pytest.mark.parametrize(("env_id", "mode"), values)
 
 
 def lasting(env_id, steps):
@@ -119,8 +128,7 @@ def test_same_bits(env_id, n, steps):
     assert assert_alike(native, sync, steps) > n // 2
 
 
-@each_id
-@each_mode
+@in_every_mode()
 @pytest.mark.parametrize(("n", "steps"), [(7, 700), slow(65, 150), (130, 80)])
 def test_same_bits_in_every_mode(env_id, mode, n, steps):
     native, sync = pair(env_id, n, mode, **lasting(env_id, 50))
@@ -141,8 +149,7 @@ def test_same_bits_for_long(env_id, mode, n, steps):
     assert assert_alike(native, sync, steps, seed=2) >= n
 
 
-@each_engine
-@each_mode
+@in_every_mode(of=engine)
 def test_same_bits_where_parameters_differ(env_id, mode):
     native, sync = mixed_pair(env_id, mode, **lasting(env_id, 250))
     assert_same(native.reset(seed=5), sync.reset(seed=5))
@@ -165,16 +172,14 @@ def test_same_bits_with_a_coarse_step(env_id):
     assert_alike(native, sync, 300)
 
 
-@each_id
-@each_mode
+@in_every_mode()
 def test_same_diagnostics(env_id, mode):
     native, sync = pair(env_id, 5, mode, diagnostics=True, **lasting(env_id, 25))
     assert_same(native.reset(seed=3), sync.reset(seed=3))
     assert assert_alike(native, sync, 40) > 0
 
 
-@each_id
-@each_mode
+@in_every_mode()
 def test_max_episode_steps(env_id, mode):
     native, sync = pair(env_id, 3, mode, max_episode_steps=9)
     assert_same(native.reset(seed=3), sync.reset(seed=3))
@@ -330,8 +335,7 @@ def test_bad_seeds(seed):
 # --- what is returned ---
 
 
-@each_id
-@each_mode
+@in_every_mode()
 def test_nothing_is_shared(env_id, mode):
     envs = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, diagnostics=True, **lasting(env_id, 8))
     kept = []

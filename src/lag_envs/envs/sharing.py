@@ -58,7 +58,7 @@ def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
 
 
 def _step_all(  # type: ignore[no-untyped-def]
-    blocks_at, f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares
+    loop, f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares
 ):
     """Take part in a turn; see `compile_step_all`."""
     at, now = np.uint64(3 * count), np.uint64(turn)
@@ -73,7 +73,7 @@ def _step_all(  # type: ignore[no-untyped-def]
             if ids[at + np.uint64(9)] != np.uint64(action.itemsize):
                 break
             step_blocks(
-                blocks_at, f, ids, par,
+                loop, f, ids, par,
                 moved(action, ids[at + np.uint64(4)]),
                 moved(obs, ids[at + np.uint64(5)]),
                 moved(reward, ids[at + np.uint64(6)]),
@@ -100,7 +100,7 @@ def _step_all(  # type: ignore[no-untyped-def]
         ids[at + np.uint64(9)] = np.uint64(action.itemsize)
         atomic_store(ids, at, now)
     step_blocks(
-        blocks_at, f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, now,
+        loop, f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, now,
         np.uint64(0), np.uint64(shares),
     )  # fmt: skip
     if not done(ids, at):
@@ -181,10 +181,10 @@ def claiming() -> list[Callable]:
 
 @cache
 def compile_step_all() -> Callable:
-    """Compile ``step_all(blocks_at, f, ids, par, action, obs, reward, ended, cut, count, turn, share, ...)``.
+    """Compile ``step_all(loop, f, ids, par, action, obs, reward, ended, cut, count, turn, share, shares)``.
 
-    The last argument is `shares`. Steps every environment; one whose episode was over is restarted instead. `blocks_at` is the `address_of`
-    the loop over the blocks that a thread can claim. `ended` and `cut` are the arrays of terminations and
+    Steps every environment; one whose episode was over is restarted instead. `loop` is the `address_of` the
+    loop over the blocks that a thread can claim. `ended` and `cut` are the arrays of terminations and
     truncations. `turn` is the number of the step, from 1.
 
     The thread with `share` 0 leads, and gets (status, over). The status is 0; or i + 1 if environment i was
@@ -196,7 +196,7 @@ def compile_step_all() -> Callable:
     from lag_envs.stepping.primitives import at_address
 
     step_blocks = at_address("step_blocks", 14)
-    return _compiled(_step_all, step_blocks, *map(_compiled, (_bad_action, _opened, _done)))
+    return _compiled(_step_all, step_blocks, _compiled(_bad_action), _compiled(_opened), _compiled(_done))
 
 
 def address_of(step_blocks: Any, *arrays: NDArray) -> int:

@@ -174,7 +174,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._step_all = sharing.compile_step_all()
         #: Type of the last actions, and where the loop over blocks for this type lies in memory.
         self._kind: np.dtype | None = None
-        self._blocks_at = 0
+        self._loop = 0
         #: Arguments of the calls that helpers are offered, by their number and the type of actions.
         self._calls: dict[tuple[int, np.dtype], list[tuple]] = {}
 
@@ -285,11 +285,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         arrays = (actions, observations, rewards, terminations, truncations)
         if actions.dtype is not self._kind:
             every = (self._memory, self._ids, self._pars[0], *arrays)
-            self._kind, self._blocks_at = actions.dtype, sharing.address_of(program.step_blocks, *every)
+            self._kind, self._loop = actions.dtype, sharing.address_of(program.step_blocks, *every)
         turn = self._turn = self._turn + 1
         rest = (*arrays, n, turn)
         shares = self._get_help(*rest) if self._most_threads > 1 else 1
-        call = (self._blocks_at, self._memory, self._ids, self._pars[0], *rest, 0, shares)
+        call = (self._loop, self._memory, self._ids, self._pars[0], *rest, 0, shares)
         status, over = self._step_all(*call)
         while over < 0:  # another program took a helper's core for a while
             time.sleep(1e-5)
@@ -529,7 +529,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             while len(self._pars) < shares:
                 self._pars.append(on_a_line(self._pars[0], len(self._program.uniform)))
             calls = self._calls[shares, kind] = [
-                (self._blocks_at, self._memory, self._ids, self._pars[i], actions, *rest, i, shares)
+                (self._loop, self._memory, self._ids, self._pars[i], actions, *rest, i, shares)
                 for i in range(1, shares)
             ]
         if calls:
@@ -599,7 +599,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions, pictures, and the helpers' data."""
-        without = ("_program", "_viewers", "_viewed", "_row", "_step_all", "_kind", "_blocks_at", "_calls")
+        without = ("_program", "_viewers", "_viewed", "_row", "_step_all", "_kind", "_loop", "_calls")
         return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

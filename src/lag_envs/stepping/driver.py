@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     return refused
 
 
-def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, float]:
+def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, Any]:
     layout = Layout(record)
     return {
         "n": record.size,
