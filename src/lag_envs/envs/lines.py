@@ -32,42 +32,6 @@ def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
     ]
 
 
-class Rows:
-    """Rows of numbers in an array: row r lies at ``array[first + r * stride]``.
-
-    Parameters
-    ----------
-    names : sequence of str
-        All rows, in their order.
-    array, first : str
-        As printed.
-    stride : int or str
-        A number, if it is known; then indices are unsigned. (A signed one could be negative, and by NumPy's
-        rules that needs a branch.)
-    """
-
-    def __init__(self, names: Sequence[str], array: str, first: str, stride: int | str) -> None:
-        self.names, self._array, self._first, self._stride = list(names), array, first, stride
-
-    def at(self, row: str) -> str:
-        """Return the place of a row."""
-        r, stride = self.names.index(row), self._stride
-        beyond = f"np.uint64({r * stride})" if isinstance(stride, int) else f"{r} * {stride}"
-        return f"{self._array}[{self._first} + {beyond}]"
-
-    def load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
-        """Return the line that reads rows into variables, by default of their names."""
-        return [f"{', '.join(names or rows)}, = read_rows({self._places(rows)})"] if rows else []
-
-    def store(self, rows: Sequence[str], values: Sequence[str] | None = None) -> list[str]:
-        """Return the line that writes values into rows, by default the variables of their names."""
-        return [f"write_rows({self._places(rows)}, ({', '.join(values or rows)},))"] if rows else []
-
-    def _places(self, rows: Sequence[str]) -> str:
-        numbers = "".join(f"{self.names.index(row)}, " for row in rows)
-        return f"{self._array}, {self._first}, {self._stride}, ({numbers})"
-
-
 def block(head: str, body: Sequence[str]) -> list[str]:
     """Put lines under a header."""
     return [head, *indent(body)]

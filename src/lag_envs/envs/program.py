@@ -24,9 +24,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs import sharing
-from lag_envs.envs.lines import Rows, block, draw, function, indent, next_episode, recorded
+from lag_envs.envs.lines import block, draw, function, indent, next_episode, recorded
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.flows import split
+from lag_envs.stepping.rows import Rows
 
 DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
 SLOW = -3  #: status of a step that the fast formula does not cover

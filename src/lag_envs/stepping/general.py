@@ -24,6 +24,7 @@ from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
+from lag_envs.stepping.rows import Rows
 from lag_envs.stepping.series import TOLERANCE
 
 #: Stands in for a parameter that is 0 when deciding how to divide a step, so that derivatives with respect to
@@ -541,16 +542,14 @@ class StepCode:
     @property
     def any_step(self) -> list[str]:
         """The lines of any step, from ``y``, ``u``, ``dt``, ``order`` to ``z``, `applied`, ``status``."""
-        from lag_envs.stepping.machine import Layout
-
-        layout, n = Layout(self.record), range(self._n)
+        n = range(self._n)
         moved = [*(f"q{i}" for i in n), *(f"v{i}" for i in n)]
-        given = [*self._inputs, *moved]
+        rows = Rows([*self._inputs, *moved], "rows", "0", 1)
         return [
             *self.prepare,
-            f"write_rows(rows, 0, 1, {tuple(range(len(given)))}, ({', '.join(given)},))",
+            *rows.store(rows.names),
             "status = advance_lane(rows, dt, np.int64(order))",
-            f"{', '.join(moved)}, = read_rows(rows, 0, 1, {tuple(range(layout.q, layout.status))})",
+            *rows.load(moved),
             *self.finish,
         ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from lag_envs.envs.lines import Rows
+from lag_envs.stepping.rows import Rows
 
 
 class Ring(NamedTuple):
