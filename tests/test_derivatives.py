@@ -264,3 +264,8 @@ def test_shapes_of_gradients():
         model.vjp(np.zeros((2, 4)), [0.0, 0.0], by_states=np.ones(4))
     with pytest.raises(ValueError, match=r"cotangent must have the shape .* \(2, 4\), got \(4,\)"):
         bar.vjp(np.zeros((2, 4)), 0.0, 0.02, np.ones(4))
+    with pytest.raises(ValueError, match="cotangent must be finite, got nan"):
+        bar.vjp(np.zeros(4), 0.0, 0.02, [0.0, math.nan, 0.0, 0.0])
+    for scene in (bar, CartPole()):
+        A, B = scene.jacobian(np.zeros((0, 4)), np.zeros((0, 1)), 0.02)
+        assert A.shape == (0, 4, 4) and B.shape == (0, 4, 1)
