@@ -97,8 +97,8 @@ def _check_made(field: dataclasses.Field, value: Any) -> float:
     for rule, limit, broken in _rules(field, number):
         if broken:
             raise ValueError(
-                f"{field.name} must be {rule} {limit:g} {unit}, but follows as {number:g} {unit} from the other "
-                "parameters".replace("  ", " ")
+                f"{field.name} must be {rule} {limit:g} {unit}, but follows as {number:g} {unit} from the "
+                "other parameters"
             )
     return number
 
