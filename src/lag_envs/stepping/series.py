@@ -710,7 +710,7 @@ def _slope_of_tanh(t: Target, x: Any) -> Any:
     """Return 1 - tanh², with all digits also where tanh is nearly 1.
 
     Taking 1 - tanh² literally would leave it a few digits or none, and so all coefficients of tanh. Where
-    tanh rounds to 1 they would be 0, and a step on which it falls would be certified as one on which it stays.
+    tanh rounds to 1 they would be 0, and a step on which it falls to 0 would be certified with it at 1.
     """
     fading = t.elementary("exp", t.mul(t.number(-2.0), t.abs(x)))
     grown = t.add(t.number(1.0), fading)
