@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import mpmath
 import numpy as np
+import own_tasks
 import pytest
 from covering import covering, engine, slow
 from test_jacobian import exact_step
@@ -256,6 +257,16 @@ def test_choices_have_no_gradient():
     task = next(task for task in (kind() for kind in TASKS.values()) if task.formulas.choices)
     with pytest.raises(ValueError, match="list of actions to choose from"):
         Model(task).vjp([[0.0] * 4], [1])
+
+
+def test_task_without_actions():
+    task = own_tasks.Drift()  # rewards theta's change
+    given = {"by_states": [[1.0, 0.0]], "by_rewards": 1.0, "parameters": ["length"]}
+    found = Model(task).vjp([[1.0, 0.5]], np.empty((1, 0)), **given)
+    A, _, P = task.scene.jacobian([1.0, 0.5], [], task.dt, parameters=["length"])
+    np.testing.assert_allclose(found.states[0], 2.0 * A[0] - [1.0, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(found.parameters[0], 2.0 * P[0], rtol=1e-12)
+    assert found.actions.shape == (1, 0)
 
 
 def test_shapes_of_gradients():
