@@ -188,6 +188,13 @@ def test_parameter_made_from_others():
     with pytest.raises(ValueError, match="finite"):
         PivotedBar(mass=math.inf)
 
+    class Difference(cart(False)):
+        rest: float = parameter(lambda scene: scene.mass - 2.0, "kg", above=0.0)
+
+    assert Difference(mass=3.0).rest == 1.0
+    with pytest.raises(ValueError, match="rest must be above 0 kg, but follows as -1 kg"):
+        Difference()
+
     class Uniform(cart(False)):
         inertia: float = parameter(None, "kg m²", least=0.0)
 
@@ -748,6 +755,13 @@ def test_class_that_no_module_has_goes_by_value():
     for first, second in zip(lines[::2], lines[1::2], strict=True):
         assert first.endswith("Cart(mass=2.0, spring=4.0, springs=1, pair=(1, 2)) -0.5 True")
         assert second == "mass must be above 0 kg, got -1 kg"
+
+
+def test_class_whose_module_is_not_there():
+    """It was sent by value, before its first use, to a process that cannot import its module."""
+    control = {"modes": {"push": {"force": "N"}}, "controls": {}, "__module__": "nowhere"}
+    assert type("Moved", (cart(False),), control)().control == "push"
+    assert "nowhere" not in sys.modules
 
 
 MAIN = """

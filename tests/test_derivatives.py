@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import mpmath
 import numpy as np
+import own_tasks
 import pytest
 from covering import covering, engine, slow
 from test_jacobian import exact_step
@@ -264,9 +265,24 @@ def test_choices_have_no_gradient():
         Model(task).vjp([[0.0] * 4], [1])
 
 
+def test_task_without_actions():
+    task = own_tasks.Drift()  # rewards theta's change
+    given = {"by_states": [[1.0, 0.0]], "by_rewards": 1.0, "parameters": ["length"]}
+    found = Model(task).vjp([[1.0, 0.5]], np.empty((1, 0)), **given)
+    A, _, P = task.scene.jacobian([1.0, 0.5], [], task.dt, parameters=["length"])
+    np.testing.assert_allclose(found.states[0], 2.0 * A[0] - [1.0, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(found.parameters[0], 2.0 * P[0], rtol=1e-12)
+    assert found.actions.shape == (1, 0)
+
+
 def test_shapes_of_gradients():
     model, bar = Model(TASKS["PivotedBar-v0"]()), PivotedBar()
     with pytest.raises(ValueError, match=r"by_states must be one number or have shape \(2, 4\), got \(4,\)"):
         model.vjp(np.zeros((2, 4)), [0.0, 0.0], by_states=np.ones(4))
     with pytest.raises(ValueError, match=r"cotangent must have the shape .* \(2, 4\), got \(4,\)"):
         bar.vjp(np.zeros((2, 4)), 0.0, 0.02, np.ones(4))
+    with pytest.raises(ValueError, match="cotangent must be finite, got nan"):
+        bar.vjp(np.zeros(4), 0.0, 0.02, [0.0, math.nan, 0.0, 0.0])
+    for scene in (bar, CartPole()):
+        A, B = scene.jacobian(np.zeros((0, 4)), np.zeros((0, 1)), 0.02)
+        assert A.shape == (0, 4, 4) and B.shape == (0, 4, 1)

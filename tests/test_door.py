@@ -776,6 +776,22 @@ def dataclass_that_is_not_frozen():
     return Bad
 
 
+@mistake("", "frozen", "kw_only=True")
+def dataclass_with_a_parameter_that_is_not_frozen():
+    @dataclasses.dataclass
+    class Bad(Scene):
+        mass: float = parameter(1.0, "kg", above=0.0)
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return self.mass * v.x**2
+
+        def potential(self, q, xp):
+            return q.x**2
+
+    return Bad
+
+
 @mistake("", "0.1", "drive, unpack and pack")
 def scene_of_version_0_1():
     class Bad(Good):
@@ -827,6 +843,11 @@ def test_there_are_many_kinds_of_mistakes():
 def test_what_is_refused_is_a_type_error_and_a_value_error():
     """Catching one of them catches all."""
     assert issubclass(FormulaError, TypeError) and issubclass(FormulaError, ValueError)
+
+
+def test_unit_of_a_parameter():
+    with pytest.raises(FormulaError, match="the unit of a parameter must be text, got 3"):
+        parameter(1.0, 3)
 
 
 @pytest.mark.parametrize(

@@ -546,6 +546,37 @@ def test_step_that_cannot_be_certified_is_refused(scene, state):
     np.testing.assert_array_equal(trajectory, [state] + [[7.0] * len(state)] * 2)
 
 
+class Sliding(Scene):
+    """A force tanh(x), and x moves evenly: the gain of speed has a closed form."""
+
+    mass: float = parameter(1e-6, "kg", above=0.0)
+    force: float = parameter(1000.0, "N", above=0.0)
+    coordinates = {"x": "m", "y": "m"}
+
+    def kinetic(self, q, v, xp):
+        return (self.mass * v.x**2 + v.y**2) / 2
+
+    def potential(self, q, xp):
+        return 0.0
+
+    def applied(self, q, v, u, xp):
+        return {"y": self.force * xp.tanh(q.x)}
+
+
+@pytest.mark.parametrize("x", [12.0, 16.0, 18.5, 19.3, 25.0, -19.3, 300.0])
+def test_tanh_that_rounds_to_one_keeps_its_digits(x):
+    """Its slope must not come from 1 - tanh², which has none left: the step would be certified, and wrong."""
+    scene, dt = Sliding(), 0.02
+    rate = -math.copysign(8.0, x) / dt
+    after = scene.simulate([x, rate, 0.0, 0.0], 1, dt)[1]
+    end, start = abs(x) - 8.0, abs(x)
+    logarithm = -8.0 + math.log1p(math.exp(-2.0 * end)) - math.log1p(math.exp(-2.0 * start))
+    error = abs(after[3] - scene.force * logarithm / rate)
+    assert error < 1e-14 * abs(after[3])
+    wanted = scene.force * math.sinh(8.0) / (math.cosh(start) * math.cosh(end)) / abs(rate)
+    assert scene.jacobian([x, rate, 0.0, 0.0], [], dt)[0][3, 0] == pytest.approx(wanted, rel=1e-12)
+
+
 def test_refusal_of_a_scene_brings_what_went_before():
     with pytest.raises(StepRefused, match="step 2 of 4") as refusal:
         Polar().simulate([0.5, -10.0, 0.0, 0.0], 4, 0.02)

@@ -34,6 +34,7 @@ except ModuleNotFoundError as error:
 import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.device import DeviceEnvs
 from lag_envs.envs.model import Model
+from lag_envs.envs.single import LagrangianEnv
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.tasks.base import Task
 
@@ -91,6 +92,8 @@ class Step:
         if options and not isinstance(task, str):
             raise ValueError(f"options go with an id; the given task has its own, got {sorted(options)}")
         made: Any = gym.make(task, **options).unwrapped if isinstance(task, str) else None
+        if made is not None and not isinstance(made, LagrangianEnv):
+            raise ValueError(f"{task} has no derivatives: it is no environment of this package")
         self.task = _checked_task(task if made is None else made.task)
         self.model = Model(self.task)
         formulas = self.task.formulas

@@ -23,7 +23,7 @@ from lag_envs.mechanics.recording import TWIN, Values
 from lag_envs.scenes import picture, steps
 from lag_envs.scenes.checks import check_both
 from lag_envs.scenes.declaring import MAPPINGS, SEQUENCES, complete, controls_of, declare
-from lag_envs.scenes.door import admit
+from lag_envs.scenes.door import admit, check_class
 from lag_envs.scenes.parameters import parameter as parameter
 from lag_envs.scenes.shapes import Window
 
@@ -50,6 +50,7 @@ class SceneType(ABCMeta):
     def __call__(cls, *args: Any, **keywords: Any) -> Any:
         """Return a scene with checked parameters and formulas."""
         complete(cls)
+        check_class(cls, Scene)
         scene = super().__call__(*args, **keywords)
         admit(scene, Scene)
         return scene
@@ -801,6 +802,7 @@ def _shaped(value: Any, shape: tuple[int, ...]) -> Any:
 def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
     """Return a scene from a pickle; it may be the first of its class in this process."""
     complete(cls)
+    check_class(cls, Scene)
     scene = object.__new__(cls)
     for name, value in state.items():
         object.__setattr__(scene, name, value)

@@ -7,7 +7,7 @@ import dataclasses
 import inspect
 import sys
 from collections.abc import Mapping
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 from lag_envs.mechanics import recording
@@ -49,7 +49,16 @@ def complete(cls: type) -> None:
             "Scene is the base of scenes; derive a class with coordinates, kinetic and potential"
         )
     if "__dataclass_fields__" not in vars(cls):
-        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        # For annotations that are texts, a dataclass looks into the class's module. A class that was sent to
+        # another process by value may have none there.
+        absent = cls.__module__ not in sys.modules
+        if absent:
+            sys.modules[cls.__module__] = ModuleType(cls.__module__)
+        try:
+            dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        finally:
+            if absent:
+                del sys.modules[cls.__module__]
 
 
 def declare(cls: Any, meta: type[type]) -> None:

@@ -48,7 +48,6 @@ def admit(scene: Any, base: type) -> None:
     base : type
         The class that all scenes are derived from.
     """
-    _check_class(type(scene), base)
     if scene.modes:
         mode = scene.control
         if not isinstance(mode, str) or mode not in scene.modes:
@@ -70,8 +69,8 @@ def admit(scene: Any, base: type) -> None:
         _admitted[type(scene)][key] = scene._layout, scene.mechanics
 
 
-def _check_class(cls: type, base: type) -> None:
-    """Raise a FormulaError for faults of a class that show without running its formulas."""
+def check_class(cls: type, base: type) -> None:
+    """Raise a FormulaError for faults of a class that show before there is a scene."""
     of = cls.__name__
     for c in cls.__mro__[: cls.__mro__.index(base)]:
         if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.checks import SMALLEST, check_number
 
 
@@ -41,6 +42,8 @@ def parameter(
     endless : bool
         Whether infinity is allowed.
     """
+    if not isinstance(unit, str):
+        raise FormulaError(f"the unit of a parameter must be text, got {unit!r:.60}")
     made = callable(default)
     return dataclasses.field(
         default=None if made else default,
@@ -64,9 +67,9 @@ def fill_in(scene: Any) -> None:
     made = [f for f in fields.values() if f.metadata["made"] and getattr(scene, f.name) is None]
     for field in (*(f for f in fields.values() if f not in made), *made):
         value = getattr(scene, field.name)
-        if field in made:  # if it is out of range, so are the parameters that it is computed from
+        if field in made:
             value = field.metadata["made"](scene)
-            value = None if value is None else check_number(field.name, value)
+            value = None if value is None else _check_made(field, value)
         elif value is not None or not field.metadata["optional"]:
             value = _check_range(field, value)
         object.__setattr__(scene, field.name, value)
@@ -75,12 +78,9 @@ def fill_in(scene: Any) -> None:
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
     number = check_number(field.name, value, unit, endless=field.metadata["endless"])
-    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
+    above = field.metadata["above"]
     for rule, limit, broken in (
-        ("above", above, above is not None and not number > above),
-        ("at least", least, least is not None and not number >= least),
-        ("below", below, below is not None and not number < below),
-        ("at most", most, most is not None and not number <= most),
+        *_rules(field, number),
         ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
         ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
     ):
@@ -89,3 +89,26 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
                 f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
             )
     return number
+
+
+def _check_made(field: dataclasses.Field, value: Any) -> float:
+    """Return a value computed from other parameters; it may be smaller or larger than a given one."""
+    unit, number = field.metadata["unit"], check_number(field.name, value)
+    for rule, limit, broken in _rules(field, number):
+        if broken:
+            raise ValueError(
+                f"{field.name} must be {rule} {limit:g} {unit}, but follows as {number:g} {unit} from the "
+                "other parameters"
+            )
+    return number
+
+
+def _rules(field: dataclasses.Field, number: float) -> list[tuple[str, Any, bool]]:
+    """Return for each end of the declared range its rule and limit, and whether the number breaks it."""
+    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
+    return [
+        ("above", above, above is not None and not number > above),
+        ("at least", least, least is not None and not number >= least),
+        ("below", below, below is not None and not number < below),
+        ("at most", most, most is not None and not number <= most),
+    ]

@@ -20,6 +20,7 @@ from lag_envs.scenes.checks import (
     check_state,
     check_step,
     real_array,
+    shown,
 )
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -140,6 +141,8 @@ def vjp(
         raise ValueError(
             f"cotangent must have the shape of the state after the step, {(*shape, n)}, got {seeds.shape}"
         )
+    if not np.isfinite(seeds).all():
+        raise ValueError(f"cotangent must be finite, got {seeds[~np.isfinite(seeds)][0]}")
     found = pulled(scene, states, controls, check_step(dt), seeds.reshape(-1, n), by)
     found = found.reshape(*shape, n + m + len(by))
     parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
@@ -225,6 +228,10 @@ def energy_balance(
     """See `Scene.energy_balance`."""
     dt = check_step(dt)
     controls = check_controls(scene, control, 1)
+    if controls.ndim != 1:
+        raise ValueError(f"the control must be one set of controls, got shape {controls.shape}")
+    if isinstance(nodes, bool) or not isinstance(nodes, int | np.integer) or nodes < 1:
+        raise ValueError(f"nodes must be a whole number of at least 1, got {shown(nodes)}")
     points, weights = np.polynomial.legendre.leggauss(nodes)
     times = 0.5 * dt * (points + 1.0)
     held: Any = controls[None] if scene.control_names else 1

@@ -180,6 +180,8 @@ class Lanes:
         # As in `envs/program.py`: the rows' offsets are known at compile time, so that lanes become vectors.
         row = [f"rows[np.uint64({k * LANES}) + i]" for k in range(len(columns) + len(places))]
         into, out = row[: len(columns)], row[len(columns) :]
+        work = [*(f"{n} = {at}" for n, at in zip(columns, into, strict=True)), *lines]
+        work += [f"{at} = {value}" for at, value in zip(out, values, strict=True)]
         arrays = [f"given{i}" for i in range(len(inputs))], [f"found{i}" for i in range(len(found))]
         body = [
             f"def {name}({', '.join([*arrays[0], *arrays[1], 'numbers'])}):",
@@ -191,9 +193,7 @@ class Lanes:
             f"    size = min(np.uint64({LANES}), count - first)",
             *_loops(zip(into, columns.values(), strict=True)),
             "    for i in range(size):",
-            *(f"        {n} = {at}" for n, at in zip(columns, into, strict=True)),
-            *(f"        {line}" for line in lines),
-            *(f"        {at} = {value}" for at, value in zip(out, values, strict=True)),
+            *(f"        {line}" for line in work or ["pass"]),  # a step without controls has none to compute
             *_loops(zip(places, out, strict=True)),
         ]
         self._compiled: Any = compile_function(name, "\n    ".join(body) + "\n")

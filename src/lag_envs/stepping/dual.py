@@ -54,6 +54,11 @@ class Dual:
     def neg(self, a: Number) -> Number:
         return Number(self._t.neg(a.value), None if a.slopes is None else self._wide.neg(a.slopes))
 
+    def abs(self, a: Number) -> Number:
+        t = self._t
+        sign = t.select(t.less(a.value, t.number(0.0)), t.number(-1.0), t.number(1.0))
+        return Number(t.abs(a.value), self._times(a.slopes, sign))
+
     def sub(self, a: Number, b: Number) -> Number:
         p, q, w = a.slopes, b.slopes, self._wide
         slopes = p if q is None else w.neg(q) if p is None else w.sub(p, q)

@@ -320,7 +320,7 @@ class SeriesTangent:
             if name in before:
                 values[:, i] = getattr(before[name], "value", before[name])
         slopes = np.repeat(self._first[None], count, axis=0)
-        refused = self._advance(values, slopes.reshape(count, -1), self._guide, dt, order)
+        refused = self._advance(values, slopes.reshape(count, self._first.size), self._guide, dt, order)
         if refused:
             return None, refused
 

@@ -189,6 +189,8 @@ class Series:
                 for row, column in {(i, j), (j, i)}:
                     self._pairs[row, column] = self._factor(node), Factor(self._slot("a", column))
         self._distinct = list(dict.fromkeys(self._pairs.values()))
+        #: For each node 1 - tanh² that is the slope of a tanh, the node of its argument.
+        self._slopes_of_tanh = {x.args[1]: x.args[0] for x in record.nodes if x.op == "tanh"}
         #: Number of series that are kept.
         self.slots = len(self._slots)
 
@@ -260,7 +262,7 @@ class Series:
         known: dict[int, Any] = {}
         halves: dict[int, Any] = {}
         for n, node in enumerate(record.nodes):
-            known[n] = self._first(t, node, known, scalars, q, v)
+            known[n] = self._first(t, n, known, scalars, q, v)
             self._keep(t, n, t.index(0), known[n])
             if ("d", n) in self._slots:
                 t.store(self._slots["d", n], t.index(0), zero)
@@ -340,9 +342,12 @@ class Series:
 
         t.loop(t.index(len(first)), t.plus(order, 1), [last], further)
 
-    def _first(self, t: Target, node: Node, zero: dict, scalars: dict, q: Sequence, v: Sequence) -> Any:
+    def _first(self, t: Target, n: int, zero: dict, scalars: dict, q: Sequence, v: Sequence) -> Any:
         """Return a node's coefficient of order 0, its value."""
+        node = self.record.nodes[n]
         op, args = node.op, node.args
+        if n in self._slopes_of_tanh:
+            return _slope_of_tanh(t, zero[self._slopes_of_tanh[n]])
         if op == "place":
             return q[node.index]
         if op == "velocity":
@@ -699,6 +704,17 @@ class Inverse:
         # Every sweep leaves the negative inverse of the part that was swept.
         found = {(i, j): t.neg(x) for (i, j), x in a.items() if j >= i}
         self.rows = [[found.get((min(i, j), max(i, j))) for j in range(size)] for i in range(size)]
+
+
+def _slope_of_tanh(t: Target, x: Any) -> Any:
+    """Return 1 - tanh², with all digits also where tanh is nearly 1.
+
+    Taking 1 - tanh² literally would leave it a few digits or none, and so all coefficients of tanh. Where
+    tanh rounds to 1 they would be 0, and a step on which it falls to 0 would be certified with it at 1.
+    """
+    fading = t.elementary("exp", t.mul(t.number(-2.0), t.abs(x)))
+    grown = t.add(t.number(1.0), fading)
+    return t.div(t.mul(t.number(4.0), fading), t.mul(grown, grown))
 
 
 def _add_product(t: Target, total: Any, a: Any, b: Any) -> Any:
