@@ -1,6 +1,7 @@
 """The commands that show things: list, info, play, watch, new, completion; and every help."""
 
 import argparse
+import importlib
 import os
 import re
 import subprocess
@@ -76,6 +77,26 @@ def test_examples_parse():
                     whole.parse_args([word.strip('"') for word in words])
                     count += 1
     assert count > 40
+
+
+def modules():
+    """Return the modules that are run as ``python -m``, apart from `lag_envs.cli`."""
+    for folder in ("agents", "src/lag_envs", "tools"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            text = path.read_text(encoding="utf-8")
+            if "ArgumentParser(" in text and '\nif __name__ == "__main__":' in text and path.stem != "cli":
+                yield ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("src.")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", modules())
+def test_so_has_every_module_that_is_run(module, capsys):
+    try:
+        importlib.import_module(module).main(["--help"])
+    except SystemExit as end:
+        assert end.code == 0
+    run = "make test-libraries" if module == "tools.libraries.__main__" else f"python -m {module}"
+    assert re.search(rf"^  {run.removesuffix('.__main__')}\b", capsys.readouterr().out, re.M)
 
 
 # --- list, info ---

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
+from browsers import serious
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
@@ -117,7 +118,7 @@ def test_links_lead_somewhere(site, pages):
 def test_what_is_bundled_is_noticed(site):
     """NOTICE.md covers each third-party script and style."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
-    ours = {"docs.css"}
+    ours = {"docs.css", "docs.js"}
     for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
         place = path.relative_to(site)
         if place.parts[0] in ("board", "search") or path.name in ours:
@@ -171,3 +172,15 @@ def test_in_a_browser(site, browser):
     page.get_by_role("textbox", name="Search").fill("truncation bound")
     page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
     assert not asked
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1280])
+def test_axe_finds_nothing_serious(site, browser, scheme, width):
+    page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    for name in ("index", f"environments/{next(iter(TASKS))}", "tutorial", "accuracy", "api/controllers"):
+        page.goto(f"{site.as_uri()}/{name}.html")
+        # Wide tables get their tab stop after the page has been laid out.
+        page.wait_for_timeout(500)
+        assert serious(page) == [], name
+    page.close()

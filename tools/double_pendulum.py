@@ -34,7 +34,12 @@ FRICTION = {"damping": 0.001, "damping_2": 0.001, "dry_friction": 0.16, "dry_fri
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the check; return 0 where everything agrees."""
-    parser = argparse.ArgumentParser(prog="python -m tools.double_pendulum", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.double_pendulum",
+        description=__doc__,
+        epilog="examples:\n  python -m tools.double_pendulum ../double_pendulum",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("checkout", type=Path, help="folder with the project's checkout")
     args = parser.parse_args(arguments)
     if not (args.checkout / MODEL).is_file():

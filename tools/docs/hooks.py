@@ -114,3 +114,19 @@ def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
             section.children.insert(0, Link("Board", f"{BOARD}/index.html"))
             section.children.append(Link("How to submit", "contributing.html#submit-to-the-leaderboard"))
     return nav
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Name what the theme leaves without a name for a screen reader."""
+    return named(output)
+
+
+def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+    """Do the same in pages that are not in the navigation, such as 404.html."""
+    return named(output_content)
+
+
+def named(html: str) -> str:
+    """Return a page whose search has a name."""
+    search = 'data-md-component="search" role="dialog"'
+    return html.replace(search, f'{search} aria-label="Search"')

@@ -153,6 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m lag_envs.leaderboard.shipped",
         description="Write the policies that come with the package: the best on the board, as data.",
+        epilog="examples:\n  python -m lag_envs.leaderboard.shipped",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--board", metavar="FOLDER", type=Path, default=Path("leaderboard"), help="default: leaderboard"
