@@ -89,7 +89,7 @@ def modules():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", modules())
+@pytest.mark.parametrize("module", list(modules()))
 def test_so_has_every_module_that_is_run(module, capsys):
     try:
         importlib.import_module(module).main(["--help"])
