@@ -20,7 +20,7 @@ from lag_envs.leaderboard import shipped
 from lag_envs.leaderboard.board import Board
 from lag_envs.scores import score
 from lag_envs.starter import filled
-from lag_envs.tasks import pivoted_bar
+from lag_envs.tasks import cart_pole, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
@@ -106,6 +106,8 @@ def test_list_says_what_is_to_be_done(capsys):
     assert cli.main(["list"]) == 0
     out = capsys.readouterr().out
     assert "Swing a bar up by moving its support" in out and "lag-envs watch ID" in out
+    choices = TASKS[cart_pole.Balance.id]().formulas.acting[0].values
+    assert f"{cart_pole.Balance.id}  " in out and f" {choices[0]:g} or {choices[-1]:g} N " in out
 
 
 def test_info_names_the_agents(capsys):

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def check(env_id: str, joint: int, checkout: Path) -> bool:
-    """Compare one task with the project's plant, simulator and LQR, and print and judge the results."""
+    """Compare one task with the project's plant, simulator and LQR, and print and check the results."""
     from double_pendulum.analysis.leaderboard import get_swingup_time  # type: ignore[import-not-found]
     from double_pendulum.model.model_parameters import model_parameters  # type: ignore[import-not-found]
     from double_pendulum.model.plant import DoublePendulumPlant  # type: ignore[import-not-found]

@@ -124,7 +124,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     ).parse_args(arguments)
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
-    print("\n".join(columns([["environment", "what lacks", "command"], *rows])) if rows else "Nothing lacks.")
+    print(
+        "\n".join(columns([["environment", "missing", "command"], *rows])) if rows else "Nothing is missing."
+    )
     return 1 if rows else 0
 
 
