@@ -2,6 +2,7 @@
 
 import os
 import re
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -79,6 +80,20 @@ def test_every_page_is_there(site, pages):
     # Most public objects have a docstring, and these are in the reference.
     reference = (site / "api" / "tasks.html").read_text("utf-8")
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
+
+
+def test_titles_and_previews(site, pages):
+    """Each page has a title of its own, and says what a shared link shows."""
+    texts = {name: (site / name).read_text("utf-8") for name in pages}
+    titles = {name: re.search("<title>(.*?)</title>", text)[1] for name, text in texts.items()}
+    docs = [title for name, title in titles.items() if not name.startswith("board/")]
+    assert len(set(docs)) == len(docs) > 50
+    for name, text in texts.items():
+        for what in ("title", "description"):
+            assert text.count(f'<meta property="og:{what}"') == 1, name
+    for env_id in TASKS:
+        head = texts[f"environments/{env_id}.html"].partition("</head>")[0]
+        assert f'og:description" content="{escape(TASKS[env_id].__doc__.partition(chr(10))[0])}"' in head
 
 
 def test_one_navigation(pages):

@@ -309,6 +309,8 @@ def test_frozen_boards_stand_apart():
     assert f'href="{incline.Brake.id}-protocol-1.html">{incline.Brake.id}, protocol 1<' in index
     assert "protocol-1.html" not in pages[f"{incline.Brake.id}.html"]
     assert "frozen, protocol 1" in pages[f"{incline.Brake.id}-protocol-1.html"]
+    titles = [re.search("<title>(.*?)</title>", text)[1] for text in pages.values()]
+    assert len(set(titles)) == len(titles) > 4
 
 
 def test_episodes_are_written_as_columns():

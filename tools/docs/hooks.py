@@ -6,6 +6,7 @@ import posixpath
 import re
 import sys
 from functools import cache
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -117,16 +118,31 @@ def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Name what the theme leaves without a name for a screen reader."""
-    return named(output)
+    """Add what link previews show, and a name for the search."""
+    return named(output.replace("</head>", f"{preview(page, config)}</head>", 1))
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
-    """Do the same in pages that are not in the navigation, such as 404.html."""
+    """Name the search also in pages that are not in the navigation, such as 404.html."""
     return named(output_content)
 
 
 def named(html: str) -> str:
-    """Return a page whose search has a name."""
+    """Return a page whose search has a name for screen readers; the theme leaves it without one."""
     search = 'data-md-component="search" role="dialog"'
     return html.replace(search, f'{search} aria-label="Search"')
+
+
+def preview(page: Page, config: MkDocsConfig) -> str:
+    """Return the tags of a page's title, description and picture."""
+    from lag_envs.tasks import TASKS
+
+    title, about, picture = page.meta.get("title", page.title), config.site_description, next(iter(TASKS))
+    if page.title in TASKS:
+        picture = page.title
+        about = (TASKS[picture].__doc__ or "").partition("\n")[0]
+    shown = f"images/moving/{picture}.webp"
+    tags = {"type": "article", "site_name": config.site_name, "title": title, "description": about}
+    if (ROOT / "docs" / shown).is_file():
+        tags["image"] = f"{config.site_url}{shown}"
+    return "".join(f'<meta property="og:{name}" content="{escape(str(of))}">\n' for name, of in tags.items())

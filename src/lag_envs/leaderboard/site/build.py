@@ -186,11 +186,12 @@ def render(
 
     for b in boards:
         known = {"now": b["page"], "preview": b["preview"]}
+        titled = f"{b['id']}, protocol {b['protocol']}" if b["frozen"] else b["id"]
         for row in b["rows"]:
             alone = b | {"rows": [row]}
-            title = f"{row['name']} · {b['id']}"
+            title = f"{row['name']} · {titled}"
             page("agent.html", f"{row['page']}.html", board=alone, title=title, about=_about(row), **known)
-        page("environment.html", f"{b['page']}.html", board=b, title=b["id"], about=b["title"], **known)
+        page("environment.html", f"{b['page']}.html", board=b, title=titled, about=b["title"], **known)
     news = sorted(
         ((b, row) for b in boards if not b["frozen"] for row in b["rows"] if row["added"]),
         key=lambda entry: entry[1]["added"], reverse=True,
