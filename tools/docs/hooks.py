@@ -76,7 +76,7 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
         ((title, pages),) = entry.items()
         first = pages[0] if isinstance(pages[0], str) else next(iter(pages[0].values()))
         sections.append((title, "../" + first.removesuffix("md") + "html"))
-    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections)
+    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections, SOURCE)
     return {f"{BOARD}/{name}": content for name, content in (pages | files).items()}
 
 
