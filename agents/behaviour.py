@@ -89,7 +89,12 @@ def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[
 @reports_errors("agents.behaviour")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
-    p = argparse.ArgumentParser(prog="python -m agents.behaviour", description=__doc__)
+    p = argparse.ArgumentParser(
+        prog="python -m agents.behaviour",
+        description=__doc__,
+        epilog="examples:\n  python -m agents.behaviour\n  python -m agents.behaviour PivotedBar-v0",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     p.add_argument(
         "env", nargs="*", metavar="ID", help="measure some environments; others keep their numbers"
     )

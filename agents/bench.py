@@ -37,6 +37,8 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog="python -m agents.bench",
         description=f"Compare our vector environment for Stable-Baselines3 with DummyVecEnv, on {ENV}.",
+        epilog="examples:\n  python -m agents.bench\n  python -m agents.bench --output adapter.json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--rounds", type=int, default=15, help="samples of each (default %(default)s)")
     p.add_argument("--output", type=Path, metavar="FILE", help="keep all samples as JSON")

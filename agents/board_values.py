@@ -63,7 +63,12 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
 @reports_errors("agents.board_values")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files."""
-    parser = argparse.ArgumentParser(prog="python -m agents.board_values", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m agents.board_values",
+        description=__doc__,
+        epilog="examples:\n  python -m agents.board_values\n  python -m agents.board_values PivotedBar-v0",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")
     args = parser.parse_args(arguments)

@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for reason in failed.values():
                 print(f"agents.demo: error: {reason}", file=sys.stderr)
             if stopped or failed:
-                print(f"To go on:  {command('agents.demo', arguments)}")
+                print(f"To resume: {command('agents.demo', arguments)}")
                 return 130 if stopped else 1
         report(run, video=not args.no_video)
     except KeyboardInterrupt:

@@ -127,9 +127,9 @@ def learned(env_id: str, folder: Path) -> Entrant:
         float(result["wall_seconds"]), int(result["trained"]), result["hyperparameters"], result["steps"]
         np.array(result["curve"], np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{folder / RESULT} cannot be read ({error!r}); train the run anew") from error
+        raise UserError(f"{folder / RESULT} cannot be read ({error!r}); train the run again") from error
     if not (folder / MODEL).exists():
-        raise UserError(f"{folder} has a result but no {MODEL}; train the run anew, or remove it")
+        raise UserError(f"{folder} has a result but no {MODEL}; train the run again, or remove it")
     mark = digest(folder / MODEL, folder / NORMALISATION, EXPORT)
     return Entrant(env_id, own[1], "learned", partial(_policy, env_id, folder), mark, result)
 
@@ -323,7 +323,7 @@ def measure(todo: Sequence[tuple[Evaluation, Job]]) -> None:
             agent, said = None, ""
             for evaluation, job in group:
                 try:
-                    # What draws random numbers begins anew, so that the order of measurements is all one.
+                    # Random numbers start over, so that the order of measurements does not matter.
                     if agent is None or hasattr(agent, "rng"):
                         agent = entrant.make()
                     if not job.condition.suits(agent, entrant.plans):

@@ -87,7 +87,7 @@ It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): re-run it to resume 
 examples:
   python -m agents.optimum PivotedBar-v0 --quick      one id on coarse grids, in seconds; writes to FOLDER
   python -m agents.optimum                            all ids, tens of minutes on one core
-  python -m agents.optimum PivotedBar-v0 --new        anew, forgetting what was computed"""
+  python -m agents.optimum PivotedBar-v0 --new        start over, discarding what was computed"""
 
 
 # --- what is solved -----------------------------------------------------------------------------------------
@@ -559,7 +559,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"agents.optimum: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
-        print("\nInterrupted; the same command (without --new) goes on.", file=sys.stderr)
+        print("\nInterrupted; re-run it (without --new) to resume.", file=sys.stderr)
         return 128 + (error.args[0] if error.args else signal.SIGINT)
     finally:
         signal.signal(signal.SIGTERM, before)

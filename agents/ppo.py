@@ -373,7 +373,7 @@ class Learner:
 EPILOG = f"""what is left in FOLDER/ENV/{NAME}/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, settings, versions, times
   model.zip            the network's weights: numpy.load reads it, agents.learners.load_policy plays it
-  {CHECKPOINT}       while the run is not finished: all that is needed to go on
+  {CHECKPOINT}       while the run is not finished: everything needed to resume
 
 The same seed gives the same policy, bit for bit, also where the training was interrupted (by Ctrl-C or by a
 kill) and the command run again. Settings are those of `lag-envs hyperparams {NAME}`, where no option changes
@@ -437,7 +437,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, reason in failed.items():
         print(f"{name} failed: {reason}", file=sys.stderr)
     if stopped or failed:
-        print(f"To go on:  {command('agents.ppo', arguments)}")
+        print(f"To resume: {command('agents.ppo', arguments)}")
         return 130 if stopped else 1
     print(
         f"Since the command began, with imports, compiling, tests and evaluation: "

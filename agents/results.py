@@ -40,6 +40,11 @@ EPILOG = f"""files read and written:
 
 It can be interrupted at any time; re-run it to resume. Agents that are missing now (such as other machines'
 runs) keep their numbers in the summary. Commands for different --envs may run side by side.
+
+examples:
+  python -m agents.results --quick                      see whether everything works
+  python -m agents.results --envs PivotedBar-v0 --agents ppo sac
+  python -m agents.results --redraw                     the page again, from the summary
 """
 
 

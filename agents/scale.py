@@ -44,10 +44,20 @@ FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
 PLANNED, OPTIMAL = 1_000, 4_096
 
 
+EPILOG = """examples:
+  python -m agents.scale PivotedBar-v0 --quick     a look at one environment; nothing is written
+  python -m agents.scale PivotedBar-v0 --output src/lag_envs/tasks/measured.json"""
+
+
 @reports_errors("agents.scale")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
-    p = argparse.ArgumentParser(prog="python -m agents.scale", description=__doc__)
+    p = argparse.ArgumentParser(
+        prog="python -m agents.scale",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     p.add_argument("--batches", type=int, default=8, help="of episodes (default %(default)s)")
     p.add_argument(

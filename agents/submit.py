@@ -36,7 +36,11 @@ HELP = """submissions made, a folder each, in OUT:
   ENV-CONTROLLER        every one of lag_envs.controllers
   ENV-optimal           the value functions of `python -m agents.optimum`, coarsened to a table
 
-Existing folders are kept, so that re-running resumes; --new makes them again."""
+Existing folders are kept, so that re-running resumes; --new makes them again.
+
+examples:
+  python -m agents.submit runs/submissions
+  python -m agents.submit runs/submissions --envs PivotedBar-v0 --new"""
 
 
 # --- optimal ------------------------------------------------------------------------------------------------

@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, reason in failed.items():
         print(f"{name} failed: {reason}", file=sys.stderr)
     if stopped or failed:
-        print(f"To go on:  {command('agents.train', arguments)}")
+        print(f"To resume: {command('agents.train', arguments)}")
     return 130 if stopped else 1 if failed else 0
 
 

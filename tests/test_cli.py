@@ -1,6 +1,7 @@
 """The commands that show things: list, info, play, watch, new, completion; and every help."""
 
 import argparse
+import importlib
 import os
 import re
 import subprocess
@@ -20,7 +21,7 @@ from lag_envs.leaderboard import shipped
 from lag_envs.leaderboard.board import Board
 from lag_envs.scores import score
 from lag_envs.starter import filled
-from lag_envs.tasks import pivoted_bar
+from lag_envs.tasks import cart_pole, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
@@ -79,6 +80,26 @@ def test_examples_parse():
     assert count > 40
 
 
+def modules():
+    """Return the modules that are run as ``python -m``, apart from `lag_envs.cli`."""
+    for folder in ("agents", "src/lag_envs", "tools"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            text = path.read_text(encoding="utf-8")
+            if "ArgumentParser(" in text and '\nif __name__ == "__main__":' in text and path.stem != "cli":
+                yield ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("src.")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", list(modules()))
+def test_so_has_every_module_that_is_run(module, capsys):
+    try:
+        importlib.import_module(module).main(["--help"])
+    except SystemExit as end:
+        assert end.code == 0
+    run = "make test-libraries" if module == "tools.libraries.__main__" else f"python -m {module}"
+    assert re.search(rf"^  {run.removesuffix('.__main__')}\b", capsys.readouterr().out, re.M)
+
+
 # --- list, info ---
 
 
@@ -86,6 +107,8 @@ def test_list_says_what_is_to_be_done(capsys):
     assert cli.main(["list"]) == 0
     out = capsys.readouterr().out
     assert "Swing a bar up by moving its support" in out and "lag-envs watch ID" in out
+    choices = TASKS[cart_pole.Balance.id]().formulas.acting[0].values
+    assert f"{cart_pole.Balance.id}  " in out and f" {choices[0]:g} or {choices[-1]:g} N " in out
 
 
 def test_info_names_the_agents(capsys):

@@ -2,6 +2,7 @@
 
 import os
 import re
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -9,6 +10,7 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
+from browsers import serious
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
@@ -80,6 +82,20 @@ def test_every_page_is_there(site, pages):
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
 
 
+def test_titles_and_previews(site, pages):
+    """Each page has a title of its own, and says what a shared link shows."""
+    texts = {name: (site / name).read_text("utf-8") for name in pages}
+    titles = {name: re.search("<title>(.*?)</title>", text)[1] for name, text in texts.items()}
+    docs = [title for name, title in titles.items() if not name.startswith("board/")]
+    assert len(set(docs)) == len(docs) > 50
+    for name, text in texts.items():
+        for what in ("title", "description"):
+            assert text.count(f'<meta property="og:{what}"') == 1, name
+    for env_id in TASKS:
+        head = texts[f"environments/{env_id}.html"].partition("</head>")[0]
+        assert f'og:description" content="{escape(TASKS[env_id].__doc__.partition(chr(10))[0])}"' in head
+
+
 def test_one_navigation(pages):
     """From each page to every section, and from the board back."""
     sections = [next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]]
@@ -117,7 +133,7 @@ def test_links_lead_somewhere(site, pages):
 def test_what_is_bundled_is_noticed(site):
     """NOTICE.md covers each third-party script and style."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
-    ours = {"docs.css"}
+    ours = {"docs.css", "docs.js"}
     for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
         place = path.relative_to(site)
         if place.parts[0] in ("board", "search") or path.name in ours:
@@ -171,3 +187,15 @@ def test_in_a_browser(site, browser):
     page.get_by_role("textbox", name="Search").fill("truncation bound")
     page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
     assert not asked
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1280])
+def test_axe_finds_nothing_serious(site, browser, scheme, width):
+    page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    for name in ("index", f"environments/{next(iter(TASKS))}", "tutorial", "accuracy", "api/controllers"):
+        page.goto(f"{site.as_uri()}/{name}.html")
+        # Wide tables get their tab stop after the page has been laid out.
+        page.wait_for_timeout(500)
+        assert serious(page) == [], name
+    page.close()

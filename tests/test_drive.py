@@ -382,6 +382,7 @@ def test_choices(drive, owned):
     page = drive("OwnSwitched-v0", folder=owned)
     page.keyboard.down("ArrowLeft")
     shows(page, "s\u0308", "−5.00 m/s²")
+    assert reading(page, "θ₁").endswith(" rad") and reading(page, "θ\u0307₁").endswith(" rad/s")
     page.keyboard.up("ArrowLeft")
     page.keyboard.down("3")
     shows(page, "s\u0308", "5.00 m/s²")

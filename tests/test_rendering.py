@@ -308,12 +308,6 @@ def test_record_video_without_a_warning(env_id, tmp_path):
     assert video.stat().st_size > 1000
 
 
-def test_pictures_for_the_readme_are_small(tmp_path):
-    files = rendering.write_pictures(tmp_path)
-    assert [file.stem for file in files] == IDS
-    assert max(file.stat().st_size for file in files) <= 40_000
-
-
 # --- windows ------------------------------------------------------------------------------------------------
 
 

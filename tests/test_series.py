@@ -146,7 +146,7 @@ class Judged(NamedTuple):
     nearness: float
 
 
-def judge(system, case, order, tolerance, h, bounds):
+def checked(system, case, order, tolerance, h, bounds):
     """Compare a certified step with its exact series."""
     state, control, _ = case
     q, v = taylor(system, state, control, h, order + 18)
@@ -173,7 +173,7 @@ def certified(system, generator, order, tolerance, count):
         case = draw(system, generator, order, tolerance)
         ((h, bounds),) = attempts(system, [case], order, tolerance)
         if h > 0.0:
-            found.append(judge(system, case, order, tolerance, h, bounds))
+            found.append(checked(system, case, order, tolerance, h, bounds))
     return found
 
 
@@ -266,7 +266,7 @@ def test_tails_cut_one_order_later_than_sums_are_found_out():
         case = draw(system, generator, order + 1, 1e-9)
         h, bounds = plain_attempt(system, case, order + 1, 1e-9)
         if h > 0.0:
-            found.append(judge(system, case, order, 1e-9, h, bounds).excess)
+            found.append(checked(system, case, order, 1e-9, h, bounds).excess)
     assert max(found) > 1.0
 
 

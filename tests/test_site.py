@@ -299,6 +299,15 @@ def test_agents_have_pages_and_news_are_fed():
         render(found, "javascript:1")
 
 
+def test_submissions_are_linked_where_their_files_are_public():
+    found = board_pages.data((incline.Brake.id,))
+    row = found["environments"][0]["rows"][0]
+    row["id"] = "made/by hand"
+    link = 'href="https://example.org/main/leaderboard/submissions/made/by%20hand"'
+    assert any(link in text for text in render(found, source="https://example.org/main/")[0].values())
+    assert not any("leaderboard/submissions/made/by%20hand" in text for text in render(found)[0].values())
+
+
 def test_frozen_boards_stand_apart():
     found = board_pages.data((incline.Brake.id,))
     old = found["environments"][0] | {"frozen": True, "protocol": 1}
@@ -309,6 +318,8 @@ def test_frozen_boards_stand_apart():
     assert f'href="{incline.Brake.id}-protocol-1.html">{incline.Brake.id}, protocol 1<' in index
     assert "protocol-1.html" not in pages[f"{incline.Brake.id}.html"]
     assert "frozen, protocol 1" in pages[f"{incline.Brake.id}-protocol-1.html"]
+    titles = [re.search("<title>(.*?)</title>", text)[1] for text in pages.values()]
+    assert len(set(titles)) == len(titles) > 4
 
 
 def test_episodes_are_written_as_columns():

@@ -796,13 +796,13 @@ def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
     ],
 )
 def test_export_acts_as_the_model(algo, options, tmp_path):
-    from lag_envs.leaderboard.export import Source, _algorithm, convert, difference
+    from lag_envs.leaderboard.export import Source, algorithm_of, convert, difference
 
     made, normalise = model(algo, **options)
     made.save(tmp_path / "model.zip")
     # A policy of our own does not tell what it was trained by; its training's result does.
     result = {"algo": algo.lower()} if "kind" in options else None
-    found = _algorithm(Source(tmp_path / "model.zip", result=result))
+    found = algorithm_of(Source(tmp_path / "model.zip", result=result))
     assert found == {"DDPG": "td3"}.get(algo, algo.lower())
     table, arrays = convert(made, normalise)
     agent = network(tmp_path / "a", table, arrays).policies[0][1].agent()

@@ -250,7 +250,7 @@ def test_seeds_side_by_side(command, config, tmp_path):
     (folder / "seed2").write_text("in the way")
     arguments = (ENV, "--config", str(config))
     status, output = command(*arguments, "--seeds", "3")
-    assert status == 1 and "seed 2 failed: " in output and "To go on:" in output
+    assert status == 1 and "seed 2 failed: " in output and "To resume:" in output
     assert "seed 0: finished, return" in output and "seed 1: finished, return" in output
     results = [json.loads((folder / f"seed{k}" / run.RESULT).read_text()) for k in range(2)]
     assert results[0]["evaluation"]["returns"] != results[1]["evaluation"]["returns"]

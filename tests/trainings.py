@@ -43,5 +43,5 @@ def kill_and_interrupt(*arguments):
         process.send_signal(number)
         output = process.communicate(timeout=300)[0]
     assert process.returncode == 130, output
-    assert "To go on:" in output
+    assert "To resume:" in output
     return output

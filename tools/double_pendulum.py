@@ -34,7 +34,12 @@ FRICTION = {"damping": 0.001, "damping_2": 0.001, "dry_friction": 0.16, "dry_fri
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the check; return 0 where everything agrees."""
-    parser = argparse.ArgumentParser(prog="python -m tools.double_pendulum", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.double_pendulum",
+        description=__doc__,
+        epilog="examples:\n  python -m tools.double_pendulum ../double_pendulum",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("checkout", type=Path, help="folder with the project's checkout")
     args = parser.parse_args(arguments)
     if not (args.checkout / MODEL).is_file():
@@ -45,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def check(env_id: str, joint: int, checkout: Path) -> bool:
-    """Compare one task with the project's plant, simulator and LQR, and print and judge the results."""
+    """Compare one task with the project's plant, simulator and LQR, and print and check the results."""
     from double_pendulum.analysis.leaderboard import get_swingup_time  # type: ignore[import-not-found]
     from double_pendulum.model.model_parameters import model_parameters  # type: ignore[import-not-found]
     from double_pendulum.model.plant import DoublePendulumPlant  # type: ignore[import-not-found]

@@ -7,9 +7,10 @@ that make them.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -114,10 +115,18 @@ def _measured_errors() -> Iterable[str]:
     return (row[where] for row in part["summary"]["rows"])
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Print the missing items; return 1 if there are any."""
+    argparse.ArgumentParser(
+        prog="python -m tools.missing",
+        description=__doc__,
+        epilog="examples:\n  python -m tools.missing",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    ).parse_args(arguments)
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
-    print("\n".join(columns([["environment", "what lacks", "command"], *rows])) if rows else "Nothing lacks.")
+    print(
+        "\n".join(columns([["environment", "missing", "command"], *rows])) if rows else "Nothing is missing."
+    )
     return 1 if rows else 0
 
 

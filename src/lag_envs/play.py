@@ -123,7 +123,7 @@ def help_of(task: Any, space: gym.Space) -> list[str]:
     lines = [f"{name}: keys {down} and {up}, or {stick}" for name, (down, up), stick in ways]
     return [
         *(lines or ["there is nothing to control: just watch"]),
-        "r: start anew",
+        "r: start over",
         "q, or close the window: end",
     ]
 

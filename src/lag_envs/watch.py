@@ -141,7 +141,7 @@ def _model(env_id: str, path: Path) -> Any:
         raise UserError(f'{path}: stable-baselines3 is missing: pip install "lag-envs[agents]"') from error
     try:
         source = export.find([path])[0]
-        model, normalise = export._load(source, export._algorithm(source))
+        model, normalise = export.load_model(source, export.algorithm_of(source))
     except export.ExportError as error:
         raise UserError(str(error)) from error
     env = gym.make(env_id)

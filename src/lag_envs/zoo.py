@@ -30,12 +30,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m lag_envs.zoo",
         description="Run a script of the RL Zoo on these environments; all other arguments are the script's.",
+        epilog="examples:\n  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs\n"
+        "  python -m lag_envs.zoo train --help    the options of a script",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         add_help=False,
         allow_abbrev=False,
     )
     parser.add_argument("script", help="train, enjoy, record_video, record_training, ...")
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="PACKAGE")
-    args, others = parser.parse_known_args(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] in (["-h"], ["--help"]):  # further on, it is the script's
+        parser.print_help()
+        return
+    args, others = parser.parse_known_args(given)
     if find_spec("rl_zoo3") is None:
         raise UserError('the RL Zoo is missing: pip install "lag-envs[zoo]"')
     if not args.script.isidentifier() or find_spec(f"rl_zoo3.{args.script}") is None:

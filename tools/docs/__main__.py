@@ -20,7 +20,10 @@ from tools.docs.environments import ROOT, by_scene
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the generated texts of this checkout."""
     parser = argparse.ArgumentParser(
-        prog="python -m tools.docs", description="Write the texts generated from records."
+        prog="python -m tools.docs",
+        description="Write the texts generated from records.",
+        epilog="examples:\n  python -m tools.docs\n  python -m tools.docs --pictures PivotedBar-v0",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; all by default"

@@ -7,8 +7,10 @@ actions: these three systems have no friction, so the difference must stay const
 
 from __future__ import annotations
 
+import argparse
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -111,8 +113,14 @@ def picture(env_id: str) -> Any:
     return figure
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Print returns, draw pictures."""
+    argparse.ArgumentParser(
+        prog="python -m tools.docs.energy",
+        description=__doc__,
+        epilog="examples:\n  python -m tools.docs.energy",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    ).parse_args(arguments)
     from agents.figures import save
 
     for env_id, peer_id in with_peer().items():

@@ -7,8 +7,10 @@ degrees, lost frames.
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +62,14 @@ def fitted() -> Fit:
     return Pendulum(mass=ROD["mass"]).fit([(states, None, 1.0 / RATE)], ["length", "damping"])
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Write the recording, fit it, draw the residuals."""
+    argparse.ArgumentParser(
+        prog="python -m tools.docs.fit",
+        description=__doc__,
+        epilog="examples:\n  python -m tools.docs.fit",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    ).parse_args(arguments)
     from agents.figures import save
 
     write(RECORDING, recording())

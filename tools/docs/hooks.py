@@ -6,6 +6,7 @@ import posixpath
 import re
 import sys
 from functools import cache
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
         ((title, pages),) = entry.items()
         first = pages[0] if isinstance(pages[0], str) else next(iter(pages[0].values()))
         sections.append((title, "../" + first.removesuffix("md") + "html"))
-    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections)
+    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections, SOURCE)
     return {f"{BOARD}/{name}": content for name, content in (pages | files).items()}
 
 
@@ -114,3 +115,34 @@ def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
             section.children.insert(0, Link("Board", f"{BOARD}/index.html"))
             section.children.append(Link("How to submit", "contributing.html#submit-to-the-leaderboard"))
     return nav
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Add what link previews show, and a name for the search."""
+    return named(output.replace("</head>", f"{preview(page, config)}</head>", 1))
+
+
+def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+    """Name the search also in pages that are not in the navigation, such as 404.html."""
+    return named(output_content)
+
+
+def named(html: str) -> str:
+    """Return a page whose search has a name for screen readers; the theme leaves it without one."""
+    search = 'data-md-component="search" role="dialog"'
+    return html.replace(search, f'{search} aria-label="Search"')
+
+
+def preview(page: Page, config: MkDocsConfig) -> str:
+    """Return the tags of a page's title, description and picture."""
+    from lag_envs.tasks import TASKS
+
+    title, about, picture = page.meta.get("title", page.title), config.site_description, next(iter(TASKS))
+    if page.title in TASKS:
+        picture = page.title
+        about = (TASKS[picture].__doc__ or "").partition("\n")[0]
+    shown = f"images/moving/{picture}.webp"
+    tags = {"type": "article", "site_name": config.site_name, "title": title, "description": about}
+    if (ROOT / "docs" / shown).is_file():
+        tags["image"] = f"{config.site_url}{shown}"
+    return "".join(f'<meta property="og:{name}" content="{escape(str(of))}">\n' for name, of in tags.items())

@@ -247,6 +247,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="make test-libraries ARGS=...",
         description="Run every library that we name, with its own scripts, on our environments.",
+        epilog="examples:\n  make test-libraries ARGS=gymnasium\n  make test-libraries ARGS=--docs",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(known)} (default: all)")
     parser.add_argument("--docs", action="store_true", help="write the results into docs/libraries.md")

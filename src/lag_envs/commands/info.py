@@ -23,7 +23,7 @@ def run_list(args: argparse.Namespace) -> int:
     for id, row in zip(TASKS, rows, strict=True):
         print(f"{row}\n  {(inspect.getdoc(TASKS[id]) or '').partition(chr(10))[0]}")
     print(
-        "\n`lag-envs info ID` tells more about one, `lag-envs play ID` lets you drive, "
+        "\n`lag-envs info ID` describes one, `lag-envs play ID` lets you drive, "
         "`lag-envs watch ID` shows how it is done."
     )
     return 0
@@ -41,9 +41,10 @@ def _line(id: str) -> tuple[str, ...]:
 
 
 def _range(task: Task, acting: Any) -> str:
-    """Return a control's name, range and unit."""
+    """Return a control's name, its range or choices, and its unit."""
     unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
-    return f"{acting.control} {acting.low:g} to {acting.high:g} {unit}".rstrip()
+    given = " or ".join(f"{value:g}" for value in acting.values) or f"{acting.low:g} to {acting.high:g}"
+    return f"{acting.control} {given} {unit}".rstrip()
 
 
 def declare_info(parser: argparse.ArgumentParser) -> None:

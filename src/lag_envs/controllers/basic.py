@@ -18,7 +18,7 @@ from lag_envs.tasks.base import Lifted, Task, TaskFormulas
 Array = NDArray[np.float64]
 
 
-class Law(NamedTuple):
+class FeedbackLaw(NamedTuple):
     """A controller that is pure feedback: actions a - K (x - x₀), step by step.
 
     The last entries hold from then on. The action is the clipped numbers, or for choices the index of the
@@ -50,10 +50,10 @@ class Constant:
         own: NDArray = np.atleast_1d(np.asarray(self.action, np.float32))
         return np.tile(own, (*np.shape(observation)[:-1], 1)), state
 
-    def law(self, task: Task) -> Law:
+    def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback."""
         actions, n = np.full((1, task.formulas.actions), self.action, np.float64), len(task.observation)
-        return Law(np.zeros((1, n)), actions, np.zeros((1, actions.size, n)), None)
+        return FeedbackLaw(np.zeros((1, n)), actions, np.zeros((1, actions.size, n)), None)
 
 
 def constant(task: Task, *, action: float) -> Constant:
@@ -83,10 +83,10 @@ class Feedback:
         """Return the action, for each observation."""
         return np.clip(observation @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
 
-    def law(self, task: Task) -> Law:
+    def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback."""
         m, n = self.gain.shape
-        return Law(np.zeros((1, n)), np.zeros((1, m)), -self.gain[None], None)
+        return FeedbackLaw(np.zeros((1, n)), np.zeros((1, m)), -self.gain[None], None)
 
 
 def feedback(task: Task, **gains: float) -> Feedback:
@@ -251,10 +251,10 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
     return scale, -0.5 * scale * (high + low)
 
 
-def hold_law(task: Task, rest: Array, gain: Array, read: ObservationDecoder) -> Law:
+def hold_law(task: Task, rest: Array, gain: Array, read: ObservationDecoder) -> FeedbackLaw:
     """Return the feedback with controls -K (x - rest), K of shape (n_state,) or (n_actions, n_state)."""
     scale, offset = per_control(task.formulas)
-    return Law(rest[None], offset[None], (scale[:, None] * np.atleast_2d(gain))[None], read)
+    return FeedbackLaw(rest[None], offset[None], (scale[:, None] * np.atleast_2d(gain))[None], read)
 
 
 def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:

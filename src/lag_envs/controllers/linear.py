@@ -13,7 +13,7 @@ import sympy
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from lag_envs.controllers.basic import FeedbackController, Law, hold_law
+from lag_envs.controllers.basic import FeedbackController, FeedbackLaw, hold_law
 from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
 
@@ -180,7 +180,7 @@ class Regulator(FeedbackController):
         u = -self.off(state) @ self.gain.T
         return u[..., 0] if self.gain.shape[0] == 1 else u
 
-    def law(self, task: Task) -> Law | None:
+    def law(self, task: Task) -> FeedbackLaw | None:
         """Return the controller as feedback; None for a subclass that does more."""
         return hold_law(task, self.rest, self.gain, self.read)
 
@@ -212,6 +212,6 @@ class BalanceLQR(FeedbackController):
         """Return the support's acceleration."""
         return -(state - self.rest) @ self.gain
 
-    def law(self, task: Task) -> Law:
+    def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback."""
         return hold_law(task, self.rest, self.gain, self.read)

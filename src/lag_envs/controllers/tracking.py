@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import Law, remade
+from lag_envs.controllers.basic import FeedbackLaw, remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -122,10 +122,10 @@ class Tracking(Clocked):
         actions = np.concatenate([self.actions, np.zeros((1, *self.actions.shape[1:]))])[step]
         return actions - np.einsum("i...j,ij->i...", gains, off)
 
-    def law(self, task: Task) -> Law:
+    def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback, for steps of the task's own length."""
         m, n = task.formulas.actions, len(self.rest)
-        return Law(
+        return FeedbackLaw(
             np.append(self.states[:-1], self.rest[None], axis=0),
             np.append(self.actions.reshape(-1, m), np.zeros((1, m)), axis=0),
             np.append(self.gains.reshape(-1, m, n), self.hold.reshape(1, m, n), axis=0),

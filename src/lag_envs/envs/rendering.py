@@ -2,15 +2,12 @@
 
 Shapes are turned into outlines once, in their frames; a picture is then a pose for each frame and one
 compiled call. pygame only opens windows and writes the read-out.
-
-``python -m lag_envs.envs.rendering DIRECTORY`` writes a picture of every environment as PNG.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import sys
 import time
 import unicodedata
 import weakref
@@ -18,7 +15,6 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import cache
 from itertools import accumulate, pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -805,53 +801,3 @@ def _draw_scale(surface: pygame.Surface, scale: float, longest: int) -> None:
     for x in (left, right):
         draw.line(surface, INK, (x, y - 3), (x, y + 3))
     surface.blit(label, ((left + right - label.get_width()) // 2, y - 14))
-
-
-# --- pictures of all environments -------------------------------------------------------------------------
-
-
-def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -> list[Path]:
-    """Write a picture of every environment as PNG.
-
-    Parameters
-    ----------
-    directory : str or Path
-        Where to write; created if it does not exist.
-    seconds : float, default 0.4
-        How long the control swings back and forth first [s]; an episode that ends earlier shows its end.
-    seed : int, default 9
-        Seed of the start.
-
-    Returns
-    -------
-    list of Path
-        The files, one for each id.
-    """
-    import gymnasium as gym
-
-    from lag_envs.tasks import TASKS
-
-    files = []
-    Path(directory).mkdir(parents=True, exist_ok=True)
-    for env_id in TASKS:
-        env = gym.make(env_id, render_mode="rgb_array")
-        env.reset(seed=seed)
-        task: Task = env.unwrapped.task  # type: ignore[attr-defined]
-        for i in range(round(seconds / task.dt)):
-            swing = np.float32(0.8 * math.cos(7.0 * i * task.dt))
-            action = (
-                task.rest_action if task.formulas.choices else np.full(env.action_space.shape or (), swing)
-            )
-            if any(env.step(action)[2:4]):
-                break
-        picture: Any = env.render()
-        files.append(Path(directory) / f"{env_id}.png")
-        files[-1].write_bytes(raster.png(picture))
-    return files
-
-
-if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m lag_envs.envs.rendering DIRECTORY")
-    for file in write_pictures(sys.argv[1]):
-        print(file)

@@ -26,7 +26,12 @@ BEST = 5
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the generated texts of a checkout."""
-    parser = argparse.ArgumentParser(description="Write the leaderboard's tables into a checkout.")
+    parser = argparse.ArgumentParser(
+        prog="python -m lag_envs.leaderboard.docs",
+        description="Write the leaderboard's tables into a checkout.",
+        epilog="examples:\n  python -m lag_envs.leaderboard.docs",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
     for path, text in generated(parser.parse_args(arguments).project).items():
         write(path, text)

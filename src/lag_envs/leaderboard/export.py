@@ -105,7 +105,7 @@ def _json(file: Path) -> Mapping[str, Any]:
     return content
 
 
-def _algorithm(source: Source) -> str:
+def algorithm_of(source: Source) -> str:
     """Return the algorithm of a model, as its training noted or its policy tells."""
     if (noted := (source.result or {}).get("algo")) in ALGORITHMS:
         return noted
@@ -127,10 +127,10 @@ def _algorithm(source: Source) -> str:
 
 def _name(source: Source, algo: str | None) -> str:
     """Return what a model's learner is called."""
-    return "PPO" if arrays_of(source.model) else ALGORITHMS[algo or _algorithm(source)][1]
+    return "PPO" if arrays_of(source.model) else ALGORITHMS[algo or algorithm_of(source)][1]
 
 
-def _load(source: Source, algo: str) -> tuple[Any, Any]:
+def load_model(source: Source, algo: str) -> tuple[Any, Any]:
     """Return model and normalisation, or None for the latter."""
     from importlib import import_module
 
@@ -326,7 +326,7 @@ def exported(source: Source, env: str, algo: str | None = None) -> Exported:
     if (ready := arrays_of(source.model)) is not None:
         table, arrays = ready
     else:
-        model, normalise = _load(source, algo or _algorithm(source))
+        model, normalise = load_model(source, algo or algorithm_of(source))
         table, arrays = convert(model, normalise, bool(TASKS[env]().formulas.choices))
     try:
         made = architecture(env, table)

@@ -42,7 +42,7 @@ class BoardError(Exception):
 # --- events -------------------------------------------------------------------------------------------------
 
 
-def _moment(text: str) -> str:
+def _timestamp(text: str) -> str:
     if not re.fullmatch(TIME, text):
         raise ValueError("a time is needed such as 2026-01-31T12:00:00.000000+00:00, before the year 2200")
     datetime.fromisoformat(text)
@@ -57,7 +57,7 @@ Text = Annotated[str, fields.line(1_000)]
 #: Sums of such numbers cannot overflow.
 Number = Annotated[float, between(-1e15, 1e15)]
 Positive = Annotated[float, between(0.0, 1e15)]
-Moment = Annotated[str, AfterValidator(_moment)]
+Timestamp = Annotated[str, AfterValidator(_timestamp)]
 #: A nonce's source if it is a commit of the repository that contains the board.
 COMMIT = "commit"
 
@@ -65,7 +65,7 @@ COMMIT = "commit"
 class Event(Strict):
     """The fields of all events: the time (UTC), and the hash of the log before it."""
 
-    at: Moment
+    at: Timestamp
     prev: Hash | None = None
 
 

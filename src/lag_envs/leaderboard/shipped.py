@@ -56,11 +56,11 @@ def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
 def load(env_id: str, folder: Path = FOLDER) -> Any:
     """Return an environment's policy, with the `predict` of Stable-Baselines3."""
     from lag_envs.leaderboard.policies import Policy, architecture
-    from lag_envs.leaderboard.submission import _arrays
+    from lag_envs.leaderboard.submission import read_arrays
 
     made = architecture(env_id, shipped(folder)[env_id].policy)
     file = folder / f"{env_id}.safetensors"
-    return Policy(made, _arrays(file.name, file.read_bytes(), made)).agent()
+    return Policy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
 
 
 # --- choosing them ------------------------------------------------------------------------------------------
@@ -153,6 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m lag_envs.leaderboard.shipped",
         description="Write the policies that come with the package: the best on the board, as data.",
+        epilog="examples:\n  python -m lag_envs.leaderboard.shipped",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--board", metavar="FOLDER", type=Path, default=Path("leaderboard"), help="default: leaderboard"

@@ -179,7 +179,7 @@ def load(folder: Path | str) -> Submission:
     policies: list[tuple[int, Policy]] = []
     for seed in told.seeds:
         name = f"policy_{seed}.safetensors"
-        arrays = _arrays(name, files[name], made) if made.arrays else {}
+        arrays = read_arrays(name, files[name], made) if made.arrays else {}
         policy = Policy(made, arrays)
         try:
             policy.agent()
@@ -350,7 +350,7 @@ def digest_of(files: Mapping[str, bytes]) -> str:
 # --- arrays -------------------------------------------------------------------------------------------------
 
 
-def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[np.float64]]:
+def read_arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[np.float64]]:
     """Return the arrays of a file, which must be those of the architecture."""
     from safetensors import SafetensorError
     from safetensors.numpy import load as read

@@ -102,17 +102,14 @@ def scales(case: Case, dt: float) -> list[float]:
 
     For angles and lengths max(1, |q|, |q'| dt), for their rates max(1, |q'|, the field's contribution).
     """
+    from lag_envs.report.flow_equations import EQUATIONS
     from lag_envs.report.stepped import Stepped
-    from lag_envs.stepping import pendulum
 
     scene, state, u = case
     stepped = Stepped(scene)
     y, k = stepped.lift(np.asarray(state)), stepped.numbers()
     coefficients = stepped.drive(y, u, k, np)
     q, v = (float(x) for x in stepped.unpack(y, u, k)[:2])
-    if isinstance(coefficients, pendulum.Coefficients):
-        gain = math.sqrt(math.hypot(coefficients.alpha, coefficients.beta))
-    else:
-        gain = getattr(scene, "gravity", 0.0) * dt
+    gain = EQUATIONS[type(coefficients)].field(coefficients, scene, dt)
     place, rate = max(1.0, abs(q), abs(v) * dt), max(1.0, abs(v), gain)
     return [rate if unit.endswith("/s") else place for unit in scene.state_units]

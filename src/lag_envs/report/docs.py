@@ -107,7 +107,14 @@ PARTS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write a report's compact form into a checkout."""
-    parser = argparse.ArgumentParser(description="Write a report's compact form into a checkout.")
+    parser = argparse.ArgumentParser(
+        prog="python -m lag_envs.report.docs",
+        description="Write a report's compact form into a checkout.",
+        epilog="examples:\n"
+        "  python -m lag_envs.report.docs report    what `lag-envs report` left in the folder report\n"
+        "  python -m lag_envs.report.docs           the pages again, from the stored numbers",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument(
         "report", type=Path, nargs="?", help="the report's folder; without one the pages are written again"
     )

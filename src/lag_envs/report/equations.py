@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.report.cases import Case
-from lag_envs.report.integrators import METHODS, comparison, explicit, rate
+from lag_envs.report.flow_equations import EQUATIONS
+from lag_envs.report.integrators import METHODS, comparison, explicit
 from lag_envs.report.stepped import Stepped
-from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.flows import SLIDE, TURN, pendulum_flow
 
 Array = NDArray[np.float64]
 
@@ -66,7 +65,7 @@ class Equation(ABC):
 
 
 @dataclass(frozen=True)
-class NormalForm(Equation):
+class NormalFormEquation(Equation):
     """The equation of motion of one of the three flows, with only its nonzero terms.
 
     Parameters
@@ -85,12 +84,12 @@ class NormalForm(Equation):
     @property
     def lifted(self) -> int:  # type: ignore[override]
         """Number of the flow's variables."""
-        return 2 if self.kind is slope.FixedSlope else 4
+        return EQUATIONS[self.kind].lifted
 
     @property
     def parameters(self) -> int:  # type: ignore[override]
         """Number of nonzero coefficients, plus the angle."""
-        return sum(self.present) + (self.kind is slope.TurningSlope)
+        return sum(self.present) + EQUATIONS[self.kind].turns
 
     def coefficients(self, p: Sequence) -> Any:
         """Return the flow's coefficients; the missing ones are a literal 0.0."""
@@ -99,22 +98,17 @@ class NormalForm(Equation):
 
     def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
         """Return (q', v'), and the rates of cosine and sine if these are among the unknowns."""
-        return rate(self.coefficients(p), t, y, xp, p[-1])
+        return EQUATIONS[self.kind].rate(self.coefficients(p), t, y, xp, p[-1])
 
     def stepper(self, method: str, carried: bool) -> Callable:
         """Return any of `METHODS`; all of them take the flow's variables."""
-        step = comparison(method, FLOWS[self.kind], carried).fast
+        equation = EQUATIONS[self.kind]
+        step = comparison(method, equation.flow, carried).fast
 
         def move(y: Sequence, p: Sequence, t: Any, h: Any, xp: Any) -> Sequence:
-            k = self.coefficients(p)
-            if self.kind is pendulum.Coefficients:
-                k = k._replace(delta=k.delta + k.ramp * t)
-            return step(y, k, h, xp)
+            return step(y, equation.later(self.coefficients(p), t), h, xp)
 
         return move
-
-
-FLOWS = {pendulum.Coefficients: pendulum_flow(), slope.FixedSlope: SLIDE, slope.TurningSlope: TURN}
 
 
 class Problems:
@@ -140,9 +134,9 @@ class Problems:
         ])  # fmt: skip
         present = tuple(bool(row.any()) for row in coefficients)
         #: The equation to solve.
-        self.equation: Equation = NormalForm(flow.coefficients, present)
+        self.equation: Equation = NormalFormEquation(flow.coefficients, present)
         rows = [row for row, there in zip(coefficients, present, strict=True) if there]
-        if flow.coefficients is slope.TurningSlope:
+        if EQUATIONS[flow.coefficients].turns:
             assert scene.angle is not None
             rows.append(states[:, scene.angle])
         #: Parameters, shape (parameters, problems).

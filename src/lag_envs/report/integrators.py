@@ -17,134 +17,10 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from lag_envs.stepping import pendulum, slope
+from lag_envs.report.flow_equations import EQUATIONS, FlowEquation, Problem
 from lag_envs.stepping.compiling import compile_function, compile_traced
 from lag_envs.stepping.flows import Flow, pendulum_flow
 from lag_envs.stepping.tracing import polynomial, sum_of_products
-
-#: π/2 in three parts, the first two with trailing zero bits (Cody and Waite).
-_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-_SIN = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(9)]
-_COS = [(-1.0) ** k / math.factorial(2 * k) for k in range(10)]
-
-
-def cosine_sine(angle: Any, xp: Any) -> tuple[Any, Any]:
-    """Return cosine and sine to rounding, for angles up to some 1e5 rad.
-
-    Only arithmetic, so that a compiled loop over a batch is vectorised like ours; with calls of the C library
-    the comparison integrators would be ten times slower.
-    """
-    quarter = xp.floor(angle * (2.0 / math.pi) + 0.5)
-    r = angle - quarter * _HALF_PI[0] - quarter * _HALF_PI[1] - quarter * _HALF_PI[2]
-    z = r * r
-    sine, cosine = r * polynomial(_SIN, z), polynomial(_COS, z)
-    odd = quarter - 2.0 * xp.floor(0.5 * quarter) > 0.5
-    back = quarter - 4.0 * xp.floor(0.25 * quarter)  # 0, 1, 2, 3
-    c, s = xp.where(odd, sine, cosine), xp.where(odd, cosine, sine)
-    return xp.where((back > 0.5) & (back < 2.5), -c, c), xp.where(back > 1.5, -s, s)
-
-
-class Arithmetic:
-    """A namespace with the functions of another, but with `cosine_sine` for cosine and sine."""
-
-    def __init__(self, xp: Any) -> None:
-        self._xp = xp
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._xp, name)
-
-    def cos(self, angle: Any) -> Any:
-        """Return the cosine."""
-        return cosine_sine(angle, self._xp)[0]
-
-    def sin(self, angle: Any) -> Any:
-        """Return the sine."""
-        return cosine_sine(angle, self._xp)[1]
-
-
-def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> tuple:
-    """Return (q', v') of a flow's equation, and (c', s') if cosine and sine are among the unknowns.
-
-    Parameters
-    ----------
-    coefficients : pendulum.Coefficients, slope.FixedSlope or slope.TurningSlope
-        Of the flow, at t = 0.
-    t : number
-        The time [s].
-    y : sequence
-        q, v, and the flow's cosine and sine if they are unknowns.
-    xp : namespace
-        Namespace for cosine and sine if they are not unknowns.
-    angle : number
-        The turning plane's angle at t = 0, if its cosine and sine are not unknowns [rad].
-    """
-    q, v, *pair = y
-    if isinstance(coefficients, slope.FixedSlope):
-        return v, slope.sliding(v, coefficients) + 0.0 * q
-    if isinstance(coefficients, slope.TurningSlope):
-        turn = coefficients.rate
-        if pair:
-            return v, slope.turning(q, v, pair[1], coefficients), -(turn * pair[1]), turn * pair[0]
-        return v, slope.turning(q, v, xp.sin(angle + turn * t), coefficients)
-    c, s = pair or (xp.cos(q), xp.sin(q))
-    push = pendulum.acceleration(v, c, s, coefficients) + coefficients.ramp * t
-    return (v, push, -(v * s), v * c) if pair else (v, push)
-
-
-class Problem(NamedTuple):
-    """One step's equation of motion, q'' = force(q, t) - damping_rate q'."""
-
-    force: Callable[[Any, Any], Any]
-    gradient: Callable[[Any, Any], Any]  # of the force by q
-    damping_rate: Any
-    linear: bool  # whether the gradient is constant, so that Newton's method needs one iteration
-
-    def acceleration(self, q: Any, v: Any, t: Any) -> Any:
-        """Return q''."""
-        return self.force(q, t) - self.damping_rate * v
-
-
-def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = False) -> Problem:
-    """Return the equation of motion of a flow with these coefficients, from its variables at the start.
-
-    If carried, cosines and sines are rotated from those at the start: exact to rounding up to 0.6 rad.
-    """
-    if isinstance(coefficients, pendulum.Coefficients):
-        push = coefficients._replace(gamma=0.0)
-        turn = pendulum.Coefficients(coefficients.alpha, coefficients.beta)
-        start, *pair = variables[0], *variables[2:]
-
-        def cos_sin(q: Any) -> Sequence:
-            if q is start:
-                return pair
-            return pendulum.rotate(pair[0], pair[1], q - start) if carried else cosine_sine(q, xp)
-
-        def force(q: Any, t: Any) -> Any:
-            c, s = cos_sin(q)
-            return pendulum.acceleration(0.0, c, s, push) + coefficients.ramp * t
-
-        def gradient(q: Any, t: Any) -> Any:
-            c, s = cos_sin(q)
-            return pendulum.acceleration(0.0, -s, c, turn)
-
-        return Problem(force, gradient, coefficients.gamma, False)
-    if isinstance(coefficients, slope.FixedSlope):
-        pull = coefficients.acceleration
-        return Problem(lambda q, t: pull, lambda q, t: 0.0, coefficients.damping_rate, True)
-    plane = coefficients._replace(damping_rate=0.0)
-
-    def rolling(q: Any, t: Any) -> Any:
-        if carried:
-            s = slope.rotate(variables[2], variables[3], plane.rate * t)[1]
-        else:
-            c, s = cosine_sine(plane.rate * t, xp)
-            s = variables[3] * c + variables[2] * s
-        return slope.turning(q, 0.0, s, plane)
-
-    return Problem(
-        rolling, lambda q, t: plane.centrifugal * plane.rate * plane.rate, coefficients.damping_rate, True
-    )
-
 
 # --- methods: (q, v) after one step of length h ---
 
@@ -332,33 +208,28 @@ METHODS = {
 @cache
 def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
     """Return the comparison integrator of that name for the equation of a flow."""
-    method = METHODS[name]
+    method, equation = METHODS[name], EQUATIONS[flow.coefficients]
 
     def fast(variables: Sequence, coefficients: Any, dt: Any, xp: Any) -> tuple:
-        if method.tableau and carried and not isinstance(coefficients, slope.FixedSlope):
-            return _lifted(method.tableau(), variables, coefficients, dt)
-        p = problem(coefficients, variables, xp, carried)
+        if method.tableau and carried and equation.lifted > 2:
+            return _lifted(method.tableau(), equation, variables, coefficients, dt)
+        p = equation.problem(coefficients, variables, xp, carried)
         start = variables[:2]
         if method.tableau:
             q, v = explicit(method.tableau(), lambda t, y: (y[1], p.acceleration(y[0], y[1], t)), start, dt)
         else:
             assert method.step
             q, v = method.step(p, *start, dt, xp)
-        if isinstance(coefficients, pendulum.Coefficients):
-            turned = (
-                pendulum.rotate(variables[2], variables[3], q - start[0]) if carried else cosine_sine(q, xp)
-            )
-            return q, v, *turned
-        if isinstance(coefficients, slope.TurningSlope):
-            return q, v, *slope.rotate(variables[2], variables[3], coefficients.rate * dt)
-        return q, v
+        return q, v, *equation.turned(coefficients, variables, q, dt, xp, carried)
 
     return _always(flow, fast, method.order)
 
 
-def _lifted(tableau: Tableau, variables: Sequence, coefficients: Any, dt: Any) -> tuple:
+def _lifted(
+    tableau: Tableau, equation: FlowEquation, variables: Sequence, coefficients: Any, dt: Any
+) -> tuple:
     """Step a flow's variables, including the cosine-sine pair, and restore the pair's length."""
-    q, v, c, s = explicit(tableau, lambda t, y: rate(coefficients, t, y, None), variables, dt)
+    q, v, c, s = explicit(tableau, lambda t, y: equation.rate(coefficients, t, y, None), variables, dt)
     longer = 1.5 - 0.5 * (c * c + s * s)
     return q, v, c * longer, s * longer
 

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from lag_envs.report.arithmetic import Arithmetic
 from lag_envs.report.equations import Array, Equation, Problems
-from lag_envs.report.integrators import Arithmetic
 from lag_envs.report.rivals import Rival, blocks, unblocked
 from lag_envs.report.timing import Sample
 from lag_envs.scenes import PivotedBar

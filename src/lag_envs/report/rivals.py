@@ -17,9 +17,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from lag_envs.report.arithmetic import Arithmetic
 from lag_envs.report.cases import Case
 from lag_envs.report.equations import Array, Equation, Problems
-from lag_envs.report.integrators import METHODS, Arithmetic
+from lag_envs.report.integrators import METHODS
 from lag_envs.report.timing import BLOCK, Kernels, Sample, at_once, one_by_one
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block

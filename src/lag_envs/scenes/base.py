@@ -22,7 +22,7 @@ from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
 from lag_envs.scenes import picture, steps
 from lag_envs.scenes.checks import check_both
-from lag_envs.scenes.declaring import MAPPINGS, SEQUENCES, complete, controls_of, declare
+from lag_envs.scenes.declaring import MAPPINGS, ORDER, SEQUENCES, complete, controls_of, declare
 from lag_envs.scenes.door import admit, check_class
 from lag_envs.scenes.parameters import parameter as parameter
 from lag_envs.scenes.shapes import Window
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
 
 Array = NDArray[np.float64]
-
-#: Where a task stores the order of the series that it chose for its scene.
-ORDER = "_order_of_task"
 
 #: If a motion is singular, or a number too large, only the results of that state are not finite.
 _QUIET = np.errstate(all="ignore")
@@ -756,6 +753,7 @@ class Scene(metaclass=SceneType):
         from lag_envs.scenes.symbolic import from_sympy
 
         return from_sympy(
+            Scene,
             name,
             kinetic,
             potential,

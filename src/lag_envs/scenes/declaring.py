@@ -18,6 +18,9 @@ from lag_envs.mechanics.layout import units
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
 SEQUENCES = ("state", "left_out")
 
+#: Where a task stores the order of the series that it chose for its scene.
+ORDER = "_order_of_task"
+
 #: What a scene may define; all other public names of `Scene` are its calls.
 DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
 

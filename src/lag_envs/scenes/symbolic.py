@@ -10,14 +10,17 @@ import types
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import sympy
 from sympy.core.function import AppliedUndef
 
 from lag_envs.mechanics.algebra import FormulaError, Functions
 from lag_envs.mechanics.recording import Values, twin
-from lag_envs.scenes.base import Scene, parameter
+from lag_envs.scenes.parameters import parameter
+
+if TYPE_CHECKING:
+    from lag_envs.scenes.base import Scene
 
 t = sympy.Symbol("t", real=True)
 
@@ -130,6 +133,7 @@ def equations(scene: Scene) -> list[sympy.Eq]:
 
 
 def from_sympy(
+    base: type[Scene],
     name: str,
     kinetic: Any,
     potential: Any,
@@ -160,12 +164,12 @@ def from_sympy(
         (what, sympy.sympify(e))
         for what, e in (("kinetic", kinetic), ("potential", potential), ("dissipation", dissipation))
     )
-    return _scene_type(name, tuple(items), formulas)()
+    return _scene_type(base, name, tuple(items), formulas)()
 
 
 @lru_cache(maxsize=256)
-def _scene_type(name: str, items: tuple, formulas: tuple) -> type[Scene]:
-    """Return a class for these expressions; equal expressions give the same class."""
+def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> type[Scene]:
+    """Return a class derived from `Scene` for these expressions; equal expressions give the same class."""
     given = {what: dict(pairs) for what, pairs in items}
     expressions = dict(formulas)
     named = {what: {_name(key): value for key, value in of.items()} for what, of in given.items()}
@@ -198,7 +202,7 @@ def _scene_type(name: str, items: tuple, formulas: tuple) -> type[Scene]:
 
     def reduce(self: Any) -> Any:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return _remake, (name, items, formulas, fields)
+        return _remake, (base, name, items, formulas, fields)
 
     body = {
         "__doc__": f"The scene {name} of SymPy expressions.",
@@ -215,11 +219,11 @@ def _scene_type(name: str, items: tuple, formulas: tuple) -> type[Scene]:
         "applied": forces,
         **{key: parameter(value, "") for key, value in named["parameters"].items()},
     }
-    return types.new_class(name, (Scene,), exec_body=lambda space: space.update(body))
+    return types.new_class(name, (base,), exec_body=lambda space: space.update(body))
 
 
-def _remake(name: str, items: tuple, formulas: tuple, fields: dict) -> Scene:
-    return _scene_type(name, items, formulas)(**fields)
+def _remake(base: type[Scene], name: str, items: tuple, formulas: tuple, fields: dict) -> Scene:
+    return _scene_type(base, name, items, formulas)(**fields)
 
 
 def _name(symbol: Any) -> str:

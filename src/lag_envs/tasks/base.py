@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
 from lag_envs.scenes import picture
-from lag_envs.scenes.base import ORDER, Scene
+from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused, check_number, check_state, real_array
-from lag_envs.scenes.declaring import complete
+from lag_envs.scenes.declaring import ORDER, complete
 from lag_envs.scenes.door import is_own
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
 from lag_envs.scenes.steps import refusal

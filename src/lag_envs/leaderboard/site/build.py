@@ -116,11 +116,12 @@ def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
 
 
 def render(
-    data: Mapping[str, Any], url: str = "", site: Sequence[tuple[str, str]] = ()
+    data: Mapping[str, Any], url: str = "", site: Sequence[tuple[str, str]] = (), source: str = ""
 ) -> tuple[dict[str, str], dict[str, str | bytes]]:
     """Return the pages, the overview last, and the files they refer to: content by path.
 
     If the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
+    `source` is the address of the project's files, to which submissions are linked; it ends with a slash.
     """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
@@ -175,7 +176,7 @@ def render(
         "made": data["made"], "style": style,
         "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
         "embed": _embedded, "url": url and url.rstrip("/") + "/",
-        "site": site, "preview": next((b["preview"] for b in boards), None),
+        "site": site, "source": source, "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
@@ -186,11 +187,12 @@ def render(
 
     for b in boards:
         known = {"now": b["page"], "preview": b["preview"]}
+        titled = f"{b['id']}, protocol {b['protocol']}" if b["frozen"] else b["id"]
         for row in b["rows"]:
             alone = b | {"rows": [row]}
-            title = f"{row['name']} · {b['id']}"
+            title = f"{row['name']} · {titled}"
             page("agent.html", f"{row['page']}.html", board=alone, title=title, about=_about(row), **known)
-        page("environment.html", f"{b['page']}.html", board=b, title=b["id"], about=b["title"], **known)
+        page("environment.html", f"{b['page']}.html", board=b, title=titled, about=b["title"], **known)
     news = sorted(
         ((b, row) for b in boards if not b["frozen"] for row in b["rows"] if row["added"]),
         key=lambda entry: entry[1]["added"], reverse=True,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.controllers.basic import Law
+from lag_envs.controllers.basic import FeedbackLaw
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.architecture import Array, Head
 from lag_envs.leaderboard.grids import Table
@@ -254,7 +254,7 @@ def _learned(policy: Policy) -> dict[str, Any]:
     return about | {"kind": "mlp", "frames": made.frames, "padding": made.padding}
 
 
-def _feedback(law: Law) -> tuple[dict[str, Any], dict[str, Array]]:
+def _feedback(law: FeedbackLaw) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return the page's data about a controller that is pure feedback, and its arrays."""
     if law.read is None:
         return {"kind": "linear"}, {"gain": -law.gains[0].T, "offset": law.actions[0]}

@@ -7,19 +7,21 @@ import importlib.util
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.errors import hint
-from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import check_number, check_parameters, shown
 from lag_envs.scenes.fitting.determined import Determined
 from lag_envs.scenes.fitting.parameters import FreeParameters
 from lag_envs.scenes.fitting.recordings import Recording, guess, recordings_of
 from lag_envs.scenes.fitting.result import Fit, FitWarning
 from lag_envs.scenes.fitting.shooting import Shooting, cut
+
+if TYPE_CHECKING:
+    from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 

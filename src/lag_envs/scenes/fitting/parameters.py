@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.scenes.base import ORDER, Scene
+from lag_envs.scenes.declaring import ORDER
+
+if TYPE_CHECKING:
+    from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 

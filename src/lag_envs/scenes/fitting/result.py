@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.scenes.base import Scene
 from lag_envs.scenes.fitting.recordings import Recording
 from lag_envs.tables import columns
+
+if TYPE_CHECKING:
+    from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 

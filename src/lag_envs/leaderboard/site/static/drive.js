@@ -841,7 +841,7 @@
     // --- links
 
     /** Recompute a link's drive, a little in each frame, and tell whether its claim is true. */
-    function judge(hash) {
+    function checkLink(hash) {
       linked = rerunning = null;
       watch.hidden = true;
       let told;
@@ -898,7 +898,7 @@
       }
       verdict.textContent = "";
       if (hash.includes(MARK)) {
-        judge(hash);
+        checkLink(hash);
         return;
       }
       const match = /^#seed=(\d{1,20})$/.exec(hash);

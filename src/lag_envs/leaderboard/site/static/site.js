@@ -70,11 +70,12 @@
   const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
   const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
 
-  /** "theta_dot" or "psi''" as on paper. */
+  /** "theta_dot", "theta_1_dot" or "psi''" as on paper. */
   function symbol(name) {
-    const base = name.replace(/(_d+ot|')+$/, "");
-    const dots = (name.match(/'/g) ?? []).length + (/_ddot$/.test(name) ? 2 : /_dot$/.test(name) ? 1 : 0);
-    return (GREEK[base] ?? base) + ["", "\u0307", "\u0308"][Math.min(dots, 2)];
+    const [, base, index = "", rate = ""] = name.match(/^(.+?)(?:_(\d+))?(_d+ot|'+)?$/) ?? ["", name];
+    const dots = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
+    const lower = index.replace(/\d/g, (digit) => String.fromCharCode(0x2080 + Number(digit)));
+    return (GREEK[base] ?? base) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
   }
 
   // --- scenes ----------------------------------------------------------------------------------------------

@@ -1,0 +1,101 @@
+"""The package's structure: no circle of imports, no private names of other modules, no dead paths.
+
+That no import runs upwards is import-linter's business (`make lint`).
+"""
+
+import ast
+import re
+from functools import cache
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src"
+
+
+def name_of(path):
+    return ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
+
+
+FILES = {name_of(path): path for path in sorted((SOURCE / "lag_envs").rglob("*.py"))}
+OTHERS = [path for folder in ("agents", "tools") for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+@cache
+def tree(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imported(node):
+    """Return what a node imports from the package: modules, and names of them, with their local names."""
+    if isinstance(node, ast.Import):
+        found = [(alias.name, None, alias.asname) for alias in node.names]
+    elif isinstance(node, ast.ImportFrom):
+        found = []
+        for alias in node.names:
+            whole = f"{node.module}.{alias.name}"
+            if whole in FILES:
+                found.append((whole, None, alias.asname or alias.name))
+            else:
+                found.append((node.module, alias.name, alias.asname))
+    else:
+        return []
+    return [each for each in found if each[0] in FILES]
+
+
+def for_types_only(node):
+    return isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+
+
+def nodes(whole):
+    """Walk a tree, except what only type checkers read."""
+    left = [whole]
+    while left:
+        yield (node := left.pop())
+        left += [child for child in ast.iter_child_nodes(node) if not for_types_only(child)]
+
+
+def test_there_is_no_circle():
+    """Imports inside functions are included; those for types alone are not."""
+    graph = {
+        name: {module for node in nodes(tree(path)) for module, *_ in imported(node)} - {name}
+        for name, path in FILES.items()
+    }
+    # Importing a package is not a dependency on everything that it offers.
+    packages = {name for name, path in FILES.items() if path.stem == "__init__"}
+    TopologicalSorter(
+        {name: found - packages for name, found in graph.items() if name not in packages}
+    ).prepare()
+
+
+def test_private_names_stay_in_their_module():
+    for path in [*FILES.values(), *OTHERS]:
+        modules = {}
+        for node in ast.walk(tree(path)):
+            for module, name, local in imported(node):
+                assert not is_private(name or ""), (path, module, name)
+                if name is None and local:
+                    modules[local] = module
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Attribute) and is_private(node.attr):
+                owner = node.value.id if isinstance(node.value, ast.Name) else None
+                assert owner not in modules, f"{path}:{node.lineno}: {modules[owner]}.{node.attr}"
+
+
+def is_private(name):
+    return name.startswith("_") and not name.startswith("__")
+
+
+def test_the_architectures_page_names_what_exists():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    package = SOURCE / "lag_envs"
+    named = re.findall(r"`([a-z_]+(?:/[a-z_.]+)*/?(?:\.(?:py|js|json|toml))?)`", text)
+    paths = {name for name in named if "/" in name}
+    assert len(paths) > 20
+    for name in paths:
+        places = [ROOT / name, SOURCE / name, package / name, ROOT / f"{name}.py", package / f"{name}.py"]
+        assert any(place.exists() for place in places), name
+    layers = re.search(r"\| layer \|.*?\n\n", text, re.DOTALL)[0]
+    rows = " ".join(line.split("|")[1] for line in layers.strip().splitlines()[2:])
+    known = {path.stem for path in package.iterdir()} | {"agents", "tools/docs"}
+    assert set(re.findall(r"`([a-z_0-9/]+)`", rows)) <= known
