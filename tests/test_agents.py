@@ -49,7 +49,10 @@ def pair(env_id, n=3, seed=7, **options):
 
 @pytest.mark.parametrize(
     ("env_id", "options"),
-    [(ENV, {"duration": 1.0}), *(slow(task.id, {}) for task in (pivoted_bar.Balance, incline.Brake))],
+    [
+        (ENV, {"duration": 1.0}),
+        *(slow(task.id, {}) for task in (pivoted_bar.Balance, incline.Brake, incline.Tilt)),
+    ],
 )
 def test_adapter_equals_dummy_vec_env(env_id, options):
     ours, theirs = pair(env_id, **options)
