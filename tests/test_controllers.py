@@ -13,9 +13,9 @@ from agents import tune
 from agents.run import fresh_seeds
 from lag_envs.controllers import (
     ILQR,
-    PD,
     Constant,
     Random,
+    ShellPD,
     TiltLQR,
     build,
     do_nothing,
@@ -221,7 +221,7 @@ def test_what_cannot_work_is_refused():
         ILQR(make_task(BALANCE), [Constant(0.0)])
     with pytest.raises(ValueError, match="inertia=0"):
         make_controller(PUMP, "energy pump", inertia=0.0)
-    for controller in (TiltLQR, PD):
+    for controller in (TiltLQR, ShellPD):
         with pytest.raises(ValueError, match="damping"):
             controller(make_task(SHELL, damping=0.0))
 

@@ -253,6 +253,8 @@ def test_hardly_determined():
     with pytest.warns(FitWarning, match="the data hardly determine mass"):
         found = Pendulum(damping=ROD["damping"]).fit([(noisy(free, 0.03, 2), None, DT)], ["length", "mass"])
     assert f"! {found.warnings[0]}" in str(found)
+    unbounded = FreeParameters(Pendulum(), ("mass",)).values(np.array([1e4]))
+    assert unbounded == math.inf  # silently: the end of an interval
 
 
 def test_at_the_end_of_its_range():

@@ -218,11 +218,11 @@ def test_table_of_values_looks_one_step_ahead(tmp_path):
 
 @pytest.mark.parametrize("numbers", [{}, {"frequency": 3.0, "lag": 1}])
 def test_controller_is_the_built_in_one(tmp_path, numbers):
-    from lag_envs.controllers import PD
+    from lag_envs.controllers import TiltPD
 
     made = built_in(tmp_path / "a", numbers=numbers)
     observations = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 4))
-    wanted = PD(TASKS[ENV](), **numbers).predict(observations)[0]
+    wanted = TiltPD(TASKS[ENV](), **numbers).predict(observations)[0]
     assert np.array_equal(made.policies[0][1].agent().predict(observations)[0], wanted)
     assert os.listdir(tmp_path / "a") == ["submission.toml"]
 

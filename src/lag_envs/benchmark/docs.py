@@ -9,7 +9,7 @@ from typing import Any
 
 from lag_envs.benchmark import divisions
 from lag_envs.benchmark.results import times_of
-from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, Target, has_own_flow, reached
+from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, SpeedTarget, has_own_flow, reached
 from lag_envs.generated import replaced
 from lag_envs.store import write
 from lag_envs.tables import markdown_table
@@ -49,7 +49,7 @@ def markdown(report: dict[str, Any]) -> str:
     rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
     rival = ("gymnasium", "CartPole-v1")
 
-    def cell(library: str, id: str, target: Target) -> str:
+    def cell(library: str, id: str, target: SpeedTarget) -> str:
         row = rows[library, id, target.kind, target.num_envs]
         if "steps_per_second" not in row:
             return row["problem"] or "not measured"
@@ -92,7 +92,7 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def _of_series(rows: list[dict[str, Any]], target: Target) -> str:
+def _of_series(rows: list[dict[str, Any]], target: SpeedTarget) -> str:
     """Return the measurements of the general series that have a target."""
     for row in rows:
         if target.meant_for(row) and "ratio" in row:
@@ -125,7 +125,7 @@ def claim(report: dict[str, Any]) -> str:
     )
 
 
-def _range(rows: list[dict[str, Any]], target: Target) -> str:
+def _range(rows: list[dict[str, Any]], target: SpeedTarget) -> str:
     """Return the smallest and the largest ratio of rows of a target's size."""
     size = target.kind, target.num_envs
     ratios = sorted(row["ratio"][1] for row in rows if (row["kind"], row["num_envs"]) == size)

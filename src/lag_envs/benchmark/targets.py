@@ -11,7 +11,7 @@ from lag_envs.benchmark.rounds import ENERGIES
 from lag_envs.tasks import TASKS
 
 
-class Target(NamedTuple):
+class SpeedTarget(NamedTuple):
     """A target ratio against Gymnasium's CartPole-v1 of the same kind and size.
 
     Without an id, it applies to all environments whose scene has a dedicated flow, such as a driven
@@ -39,13 +39,16 @@ class Target(NamedTuple):
 
 #: For environments with a dedicated flow: one for each column of the table.
 TARGETS = (
-    Target("made", 1, 2.0),
-    Target("vector", 64, 6.0),
-    Target("vector", 1024, 3.0),
-    Target("vector", 16384, 3.0),
+    SpeedTarget("made", 1, 2.0),
+    SpeedTarget("vector", 64, 6.0),
+    SpeedTarget("vector", 1024, 3.0),
+    SpeedTarget("vector", 16384, 3.0),
 )
 #: For the general series.
-SERIES_TARGETS = (Target("vector", 16384, 1.0, "CartPole, exact"), Target("vector", 16384, 0.25, "Chain(2)"))
+SERIES_TARGETS = (
+    SpeedTarget("vector", 16384, 1.0, "CartPole, exact"),
+    SpeedTarget("vector", 16384, 0.25, "Chain(2)"),
+)
 #: Seconds from the start of a process to its end after one step, by state of the cache of compiled code.
 COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
@@ -56,7 +59,7 @@ def has_own_flow(env_id: str) -> bool:
     return env_id in TASKS and not TASKS[env_id].imperfections and TASKS[env_id]().scene._form is not None
 
 
-def reached(rows: Sequence[dict[str, Any]], target: Target) -> dict[str, float]:
+def reached(rows: Sequence[dict[str, Any]], target: SpeedTarget) -> dict[str, float]:
     """Return the median ratio of each row that should reach a target."""
     return {row["id"]: row["ratio"][1] for row in rows if "ratio" in row and target.meant_for(row)}
 

@@ -16,9 +16,9 @@ from typing import Any
 import gymnasium as gym
 
 from lag_envs.controllers.basic import Constant, Random, do_nothing
-from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR, plan_pumping
+from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, ShellPD, TiltLQR, plan_pumping
 from lag_envs.controllers.ilqr import ILQR
-from lag_envs.controllers.incline import SwitchingLine, TiltCascade, optimal_return
+from lag_envs.controllers.incline import SwitchingLine, TiltCascade, TiltPD, optimal_return
 from lag_envs.controllers.linear import BalanceLQR
 from lag_envs.controllers.pd import PD
 from lag_envs.controllers.pivoted_bar import EnergyShapingLQR, lqr, plan_swing_up
@@ -38,9 +38,11 @@ __all__ = [
     "EnergyPump",
     "EnergyShapingLQR",
     "Random",
+    "ShellPD",
     "SwitchingLine",
     "TiltCascade",
     "TiltLQR",
+    "TiltPD",
     "Tracking",
     "build",
     "controllers",

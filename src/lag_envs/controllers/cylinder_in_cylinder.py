@@ -9,7 +9,30 @@ import numpy as np
 from lag_envs.controllers.basic import Array, FeedbackController
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
+from lag_envs.controllers.pd import PD
 from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
+
+
+class ShellPD(PD):
+    """Hold a cylinder at an angle by the shell's rate; see `PD`, with the numbers that `tune` found."""
+
+    task: Tilt
+
+    def __init__(self, task: Tilt, *, frequency: float = 17.0, lag: float = 0.49) -> None:
+        super().__init__(task, frequency=frequency, lag=lag)
+
+    def find_strength(self) -> float:
+        """Return the acceleration for each unit of the shell's rate."""
+        return self.rest.gamma
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the shell's acceleration.
+
+        The wanted acceleration is -alpha sin(place) - gamma (speed - the shell's rate).
+        """
+        wanted = self.wanted(state, target)
+        rate = (wanted + self.rest.alpha * np.sin(state[..., 0])) / self.strength + state[..., 1]
+        return (rate - state[..., 2]) / self.lag
 
 
 class TiltLQR(FeedbackController):

@@ -7,12 +7,37 @@ from numpy.typing import ArrayLike
 
 from lag_envs.controllers.basic import Array, FeedbackController
 from lag_envs.controllers.linear import regulator
+from lag_envs.controllers.pd import PD
 from lag_envs.envs.model import Model
 from lag_envs.stepping.slope import FixedSlope, crossing_time
 from lag_envs.tasks.incline import Brake, Tilt
 
 #: Points of the curve along which a cylinder is braked.
 POINTS = 20_000
+
+
+class TiltPD(PD):
+    """Hold a cylinder at a mark by the tilt of its plane; see `PD`, with the numbers that `tune` found."""
+
+    task: Tilt
+
+    def __init__(self, task: Tilt, *, frequency: float = 2.5, lag: float = 0.07) -> None:
+        super().__init__(task, frequency=frequency, lag=lag)
+
+    def find_strength(self) -> float:
+        """Return the acceleration for each unit of the tilt's sine."""
+        task = self.task
+        if not task.quasi_static:
+            return self.rest.gravity
+        steepest = task.coefficients([0.0] * len(task.scene.state_names), [task.largest_tilt], np)
+        return steepest.acceleration / np.sin(task.largest_tilt)
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the tilt's rate, or the tilt; the wanted acceleration is strength sin(tilt) - drag speed."""
+        limit = np.sin(self.task.largest_tilt)
+        sine = (self.wanted(state, target) + self.rest.damping_rate * state[..., 1]) / self.strength
+        tilt = np.arcsin(np.clip(sine, -limit, limit))
+        return tilt if self.task.quasi_static else (tilt - state[..., 2]) / self.lag
 
 
 class TiltCascade(FeedbackController):

@@ -315,7 +315,7 @@ class DrivenPendulum(NormalForm):
         return StepBound(found.substeps, found.order, bounds, "proved before the step")
 
 
-class FixedSlope(NormalForm):
+class FixedSlopeForm(NormalForm):
     """The fixed slope: a closed form."""
 
     kind = slope.FixedSlope
@@ -325,7 +325,7 @@ class FixedSlope(NormalForm):
         return SLIDE
 
 
-class TurningSlope(NormalForm):
+class TurningSlopeForm(NormalForm):
     """The slope that turns at a held rate: a series summed to rounding."""
 
     kind = slope.TurningSlope
@@ -386,7 +386,7 @@ def _recognised(m: Mechanics) -> NormalForm | None:
         return _turning(m, parts)
     if parts.keys() <= {"", "gamma"}:
         terms = {"acceleration": parts.get("", {}), "damping_rate": _negative(parts.get("gamma", {}))}
-        return _form(m, FixedSlope, terms)
+        return _form(m, FixedSlopeForm, terms)
     if not parts.keys() & {"alpha", "beta"}:
         return None
     delta, ramp = dict(parts.get("", {})), {}
@@ -458,7 +458,7 @@ def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
         "gravity": parts.get("gravity", {}),
         "damping_rate": _negative(parts.get("gamma", {})),
     }
-    return _form(m, TurningSlope, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
+    return _form(m, TurningSlopeForm, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
 
 
 def _form(

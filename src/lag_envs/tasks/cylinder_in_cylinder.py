@@ -171,7 +171,10 @@ class Tilt(_Shell):
     )
     reference = "LQR"
     controllers = {
-        "PD": Controller("lag_envs.controllers.pd:PD", tune={"frequency": (2.0, 30.0), "lag": (0.05, 0.6)}),
+        "PD": Controller(
+            "lag_envs.controllers.cylinder_in_cylinder:ShellPD",
+            tune={"frequency": (2.0, 30.0), "lag": (0.05, 0.6)},
+        ),
         "LQR": Controller("lag_envs.controllers.cylinder_in_cylinder:TiltLQR", tune={"effort": (0.0, 0.5)}),
         "iLQR": Controller("lag_envs.controllers:plan", {"guess": "LQR"}, plans=True),
     }

@@ -114,7 +114,9 @@ class Tilt(Task):
     )
     reference = "cascade"
     controllers = {
-        "PD": Controller("lag_envs.controllers.pd:PD", tune={"frequency": (1.0, 5.0), "lag": (0.05, 0.3)}),
+        "PD": Controller(
+            "lag_envs.controllers.incline:TiltPD", tune={"frequency": (1.0, 5.0), "lag": (0.05, 0.3)}
+        ),
         "cascade": Controller(
             "lag_envs.controllers.incline:TiltCascade", tune={"braking": (0.3, 1.2), "effort": (0.0, 1.0)}
         ),

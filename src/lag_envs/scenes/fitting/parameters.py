@@ -56,7 +56,8 @@ class FreeParameters:
 
     def values(self, scaled: Array) -> Array:
         """Return the values of scaled ones."""
-        return np.where(self.logs, np.exp(np.where(self.logs, scaled, 0.0)), scaled)
+        with np.errstate(over="ignore"):  # the interval of what the data hardly determine ends at infinity
+            return np.where(self.logs, np.exp(np.where(self.logs, scaled, 0.0)), scaled)
 
     def slopes(self, scaled: Array) -> Array:
         """Return the derivatives of the values with respect to the scaled ones."""
