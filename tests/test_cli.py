@@ -107,8 +107,8 @@ def test_list_says_what_is_to_be_done(capsys):
     assert cli.main(["list"]) == 0
     out = capsys.readouterr().out
     assert "Swing a bar up by moving its support" in out and "lag-envs watch ID" in out
-    choices = TASKS[cart_pole.Balance.id]().formulas.acting[0].values
-    assert f"{cart_pole.Balance.id}  " in out and f" {choices[0]:g} or {choices[-1]:g} N " in out
+    choices = TASKS[cart_pole.CartPoleExact.id]().formulas.acting[0].values
+    assert f"{cart_pole.CartPoleExact.id}  " in out and f" {choices[0]:g} or {choices[-1]:g} N " in out
 
 
 def test_info_names_the_agents(capsys):
