@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from importlib.metadata import metadata
 from pathlib import Path
 
 import yaml
@@ -36,6 +37,13 @@ def test_conda_asks_for_what_pip_asks_for():
     assert run == requirements([*PROJECT["dependencies"], f"python{PROJECT['requires-python']}"])
     (script,) = recipe["build"]["python"]["entry_points"]
     assert script == "lag-envs = " + PROJECT["scripts"]["lag-envs"]
+
+
+def test_readme_links_to_pages_that_a_package_index_reaches():
+    links = re.findall(r"\]\(([^)]+)\)", metadata("lag-envs").get_payload())
+    assert len(links) > 20
+    assert not [link for link in links if not link.startswith(("https://", "#"))]
+    assert any(link.endswith(".png") and "//raw." in link for link in links)
 
 
 def test_classifiers_are_known_and_tested():
