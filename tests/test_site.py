@@ -276,12 +276,12 @@ def test_who_acts_like_another_or_looks_like_one_is_shown_as_such():
 def test_agents_have_pages_and_news_are_fed():
     found = board_pages.data((incline.Brake.id,), board_pages.AGENTS[:3])
     for i, row in enumerate(found["environments"][0]["rows"]):
-        row["added"] = f"2026-11-0{i + 1}"
+        row |= {"added": f"2026-11-0{i + 1}", "description": "see `lag-envs list` <b>"}
     pages, files = render(found, "https://example.org/board")
     env_id, own = incline.Brake.id, f"{incline.Brake.id}-00000001"
     assert f'href="{own}.html"' in pages[f"{env_id}.html"]
     page = pages[f"{own}.html"]
-    for part in ("<bdi>iLQR</bdi></h1>", "0.996", "Ada Example", 'href="https://example.org/code"',
+    for part in ("<bdi>iLQR</bdi></h1>", "0.996", "<bdi>see <code>lag-envs list</code> &lt;b&gt;</bdi>", "Ada Example", 'href="https://example.org/code"',
                  f"lag-envs watch {env_id} --agent leaderboard/submissions/{own}",
                  f'<meta property="og:title" content="iLQR · {env_id}">',
                  '<meta property="og:description" content="Controller: score 0.996, rank 1">'):  # fmt: skip
