@@ -281,7 +281,8 @@ def test_agents_have_pages_and_news_are_fed():
     env_id, own = incline.Brake.id, f"{incline.Brake.id}-00000001"
     assert f'href="{own}.html"' in pages[f"{env_id}.html"]
     page = pages[f"{own}.html"]
-    for part in ("<bdi>iLQR</bdi></h1>", "0.996", "<bdi>see <code>lag-envs list</code> &lt;b&gt;</bdi>", "Ada Example", 'href="https://example.org/code"',
+    for part in ("<bdi>iLQR</bdi></h1>", "0.996",
+                 "<bdi>see <code>lag-envs list</code> &lt;b&gt;</bdi>", "Ada Example", 'href="https://example.org/code"',
                  f"lag-envs watch {env_id} --agent leaderboard/submissions/{own}",
                  f'<meta property="og:title" content="iLQR · {env_id}">',
                  '<meta property="og:description" content="Controller: score 0.996, rank 1">'):  # fmt: skip
