@@ -324,7 +324,7 @@ def test_a_gamepad_drives_and_may_leave(drive):
     shows(page, "φ\u0307", "0.50")
     page.evaluate("window.pad.connected = false")
     until(page, "document.querySelector('.message').textContent.startsWith('The gamepad is disconnected')")
-    assert page.evaluate("document.querySelector('.go').textContent") == "Go on"
+    assert page.evaluate("document.querySelector('.go').textContent") == "Resume"
     page.focus(".stage")
     page.keyboard.press("Space")
     until(page, "document.querySelector('.go').textContent === 'Pause'")

@@ -707,7 +707,7 @@
     }
 
     function label() {
-      go.textContent = running ? "Pause" : me.steps && !me.over ? "Go on" : "Start";
+      go.textContent = running ? "Pause" : me.steps && !me.over ? "Resume" : "Start";
     }
 
     function run() {
