@@ -412,6 +412,8 @@ class CartPoleSwingUp(_OnTrack):
             "episode_share": 1.0,
             "actor": [64, 64],
         },
+        # Four updates a step learn to catch the pole; a falling rate keeps it.
+        "off_policy": {"gradient_steps": 4, "learning_rate": "lin_2e-3"},
     }
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0]},

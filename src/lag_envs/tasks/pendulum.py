@@ -251,6 +251,7 @@ class PendulumRegret(_Rod):
     hyperparameters = {
         "ppo": {"gamma": 0.999},
         "fast_ppo": {"gamma": 0.995, "episode_share": 1.0},
+        "off_policy": {"n_timesteps": 8e4, "learning_rate": "lin_2e-3"},
     }
     examples = dataclasses.replace(
         _Rod.examples,
