@@ -274,13 +274,13 @@ def test_keys_become_actions():
 
 
 @pytest.mark.parametrize("name", [f"{SEVERAL}:Deliver", f"{SEVERAL}:Switched", f"{SEVERAL}:Drift", BALL])
-def test_play_steps_and_starts_anew(name, monkeypatch, capsys):
+def test_play_steps_and_starts_over(name, monkeypatch, capsys):
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     assert main(["play", name, "--steps", "25", "--seed", "1"]) == 0
     out = capsys.readouterr().out
-    assert "r: start anew" in out
+    assert "r: start over" in out
     if name.endswith("Drift"):
         assert "time is up: return" in out
 
