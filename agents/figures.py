@@ -176,7 +176,9 @@ def improvement_figure(envs: Mapping[str, Data]) -> Any:
     shown = {env_id: env for env_id, env in envs.items() if env["improvement"]}
     figure, axes = _panels(shown, [1.4 + 0.3 * len(env["improvement"]) for env in shown.values()])
     for ax, env in zip(axes, shown.values(), strict=True):
-        names = {name: brief(name, agent) for name, agent in env["agents"].items()}
+        # Whoever learned anything is better than no control and random control.
+        named = ((name, brief(name, agent)) for name, agent in env["agents"].items())
+        names = {name: short for name, short in named if name not in ("zero", "random")}
         rows = [names[row] for row in env["improvement"]]
         values = np.array(
             [[r.get(c, {}).get("value", math.nan) for c in names] for r in env["improvement"].values()]
