@@ -294,7 +294,7 @@ def test_vector_environment_draws_each_of_its_environments():
     envs.close()
 
 
-@pytest.mark.parametrize("env_id", ["PivotedBar-v0", *map(slow, list(TASKS)[1:])])
+@pytest.mark.parametrize("env_id", [IDS[0], *map(slow, IDS[1:])])
 def test_record_video_without_a_warning(env_id, tmp_path):
     pytest.importorskip("moviepy")
     env = gym.wrappers.RecordVideo(
