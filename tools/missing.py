@@ -7,7 +7,6 @@ that make them.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
@@ -19,6 +18,7 @@ from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import known
+from tools.options import take_none
 
 ROOT = Path(__file__).parents[1]
 #: Everything that can be generated, with its command; ID stands for the environment.
@@ -117,12 +117,7 @@ def _measured_errors() -> Iterable[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the missing items; return 1 if there are any."""
-    argparse.ArgumentParser(
-        prog="python -m tools.missing",
-        description=__doc__,
-        epilog="examples:\n  python -m tools.missing",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    ).parse_args(arguments)
+    take_none("python -m tools.missing", __doc__, arguments)
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
     print(
         "\n".join(columns([["environment", "missing", "command"], *rows])) if rows else "Nothing is missing."

@@ -7,7 +7,6 @@ actions: these three systems have no friction, so the difference must stay const
 
 from __future__ import annotations
 
-import argparse
 import sys
 import warnings
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from lag_envs.report.episodes import random_actions
 from lag_envs.report.gymnasium_peers import PEERS, watch
 from lag_envs.scenes.base import Scene
 from lag_envs.tasks import TASKS
+from tools.options import take_none
 
 ROOT = Path(__file__).parents[2]
 Array = NDArray[np.float64]
@@ -115,12 +115,7 @@ def picture(env_id: str) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print returns, draw pictures."""
-    argparse.ArgumentParser(
-        prog="python -m tools.docs.energy",
-        description=__doc__,
-        epilog="examples:\n  python -m tools.docs.energy",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    ).parse_args(arguments)
+    take_none("python -m tools.docs.energy", __doc__, arguments)
     from agents.figures import save
 
     for env_id, peer_id in with_peer().items():

@@ -7,7 +7,6 @@ degrees, lost frames.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ import numpy as np
 from lag_envs.scenes import Pendulum
 from lag_envs.scenes.fitting.result import Fit
 from lag_envs.store import write
+from tools.options import take_none
 
 ROOT = Path(__file__).parents[2]
 RECORDING = ROOT / "examples" / "pendulum.csv"
@@ -64,12 +64,7 @@ def fitted() -> Fit:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the recording, fit it, draw the residuals."""
-    argparse.ArgumentParser(
-        prog="python -m tools.docs.fit",
-        description=__doc__,
-        epilog="examples:\n  python -m tools.docs.fit",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    ).parse_args(arguments)
+    take_none("python -m tools.docs.fit", __doc__, arguments)
     from agents.figures import save
 
     write(RECORDING, recording())

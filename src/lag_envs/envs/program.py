@@ -31,10 +31,6 @@ from lag_envs.stepping.rows import Rows
 
 DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
 SLOW = -3  #: status of a step that the fast formula does not cover
-#: The arguments of `step_blocks`.
-STEP_BLOCKS = (
-    "f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, turn, share, shares"
-)
 
 
 def constants_of(task: Any) -> dict[str, float]:
@@ -409,7 +405,7 @@ class Program:
                 *(line for entry in self._shown for line in block(lane, [entry])),
             ]),
         ]  # fmt: skip
-        return function("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming(), inner=True)
+        return function("step_blocks", sharing.STEP_BLOCKS, body, *helpers, *sharing.claiming(), inner=True)
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""

@@ -37,6 +37,10 @@ PATIENCE = 200_000
 #: first of the row `n`. After them come, for each block, the turn in which it was last claimed, and for each
 #: share whether a helper has it.
 WORDS = 12
+#: The arguments of `step_blocks`, the loop over the blocks that a thread claims.
+STEP_BLOCKS = (
+    "f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, turn, share, shares"
+)
 
 
 def words(blocks: int) -> int:
@@ -195,7 +199,7 @@ def compile_step_all() -> Callable:
     """
     from lag_envs.stepping.primitives import at_address
 
-    step_blocks = at_address("step_blocks", 14)
+    step_blocks = at_address("step_blocks", len(STEP_BLOCKS.split(", ")))
     return _compiled(_step_all, step_blocks, _compiled(_bad_action), _compiled(_opened), _compiled(_done))
 
 

@@ -37,7 +37,6 @@ class Flow(NamedTuple):
     respect to the variables and the named coefficients. ``order`` is the order of the certified series, 0 if
     there is none; ``tolerance`` is the largest truncation error of θ' allowed in one step [rad/s]. ``method``
     describes how a step is taken.
-    words how a step is taken.
     """
 
     size: int

@@ -14,7 +14,7 @@ from lag_envs.envs.imperfect.pushes import pushes
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import function, indent, next_episode
-from lag_envs.envs.program import SLOW, STEP_BLOCKS
+from lag_envs.envs.program import SLOW
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.tasks.base import Task
 
@@ -226,7 +226,7 @@ class ImperfectProgram(DrawnProgram):
             ])),
         ]  # fmt: skip
         helpers = self.take, self.launch, *sharing.claiming()
-        return function("step_blocks", STEP_BLOCKS, body, *helpers, inner=True)
+        return function("step_blocks", sharing.STEP_BLOCKS, body, *helpers, inner=True)
 
     def _at_lane(self, row: str) -> str:
         return f"f[base + {self.kept.index(row) * BLOCK}]"
