@@ -18,7 +18,8 @@ from gymnasium.vector import AutoresetMode
 from lag_envs import nvrtc
 from lag_envs.envs.kernels import APART, kernels_of
 from lag_envs.envs.single import key_of, start_options
-from lag_envs.envs.vector import LagrangianVectorEnv, check_count, named, seeds_of
+from lag_envs.envs.vector import LagrangianVectorEnv, named, seeds_of
+from lag_envs.scenes.checks import check_count
 from lag_envs.stepping.cache import kept
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS

@@ -32,7 +32,7 @@ from lag_envs.envs.single import (
     true_spec,
 )
 from lag_envs.scenes import StepRefused
-from lag_envs.scenes.checks import is_masked, real_array, shown
+from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -648,14 +648,6 @@ def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
     raise ValueError(
         f"autoreset_mode must be one of {', '.join(m.value for m in AutoresetMode)}, got {shown(mode)}"
     )
-
-
-def check_count(name: str, value: Any) -> int:
-    """Return an integer of at least 1 as int, or raise a ValueError."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
-    if not whole or not 1 <= value < 2**63:
-        raise ValueError(f"{name} must be a whole number of at least 1 and below 2**63, got {shown(value)}")
-    return int(value)
 
 
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:

@@ -229,3 +229,11 @@ def check_applied(names: tuple[str, ...], applied: ArrayLike, decays: Array) -> 
         if value != 0.0 and decay == 0.0:
             raise ValueError(f"applied: {name} does not lag, so it cannot start at {value:g}; give 0")
     return array
+
+
+def check_count(name: str, value: Any) -> int:
+    """Return an integer of at least 1 as int, or raise a ValueError."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
+    if not whole or not 1 <= value < 2**63:
+        raise ValueError(f"{name} must be a whole number of at least 1 and below 2**63, got {shown(value)}")
+    return int(value)

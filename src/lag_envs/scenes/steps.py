@@ -14,13 +14,13 @@ from lag_envs.scenes.checks import (
     check_applied,
     check_both,
     check_controls,
+    check_count,
     check_lags,
     check_parameters,
     check_sequence,
     check_state,
     check_step,
     real_array,
-    shown,
 )
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -230,9 +230,7 @@ def energy_balance(
     controls = check_controls(scene, control, 1)
     if controls.ndim != 1:
         raise ValueError(f"the control must be one set of controls, got shape {controls.shape}")
-    if isinstance(nodes, bool) or not isinstance(nodes, int | np.integer) or nodes < 1:
-        raise ValueError(f"nodes must be a whole number of at least 1, got {shown(nodes)}")
-    points, weights = np.polynomial.legendre.leggauss(nodes)
+    points, weights = np.polynomial.legendre.leggauss(check_count("nodes", nodes))
     times = 0.5 * dt * (points + 1.0)
     held: Any = controls[None] if scene.control_names else 1
     states = np.array([scene.simulate(state, held, t)[1] for t in [*times, dt]])
