@@ -30,6 +30,8 @@ from lag_envs.leaderboard.submission import Refused, Submission, load, write
 
 Array = NDArray[np.float64]
 AUTHORS, LICENSE = ["the lag_envs authors"], "MIT"
+#: The folder of this file where everybody can read it.
+CODE = "https://github.com/lag-envs/lag-envs/blob/main/agents/"
 
 HELP = """submissions made, a folder each, in OUT:
   ENV-ALGO              from RUNS/ENV/ALGO/seed*/, if at least five seeds are finished
@@ -119,9 +121,11 @@ def learned(env_id: str, runs: Path, folder: Path) -> Submission:
     algo = runs.name
     name = label(algo) if algo in LEARNERS else algo
     origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
+    module = OWN[algo][0].removeprefix("agents.") if algo in OWN else "learners"
     made, off, count = export(
         find([runs]), folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
         description=f"{origin}, hyperparameters as `lag-envs hyperparams` prints them",
+        code=f"{CODE}{module}.py",
     )  # fmt: skip
     if count:
         print(

@@ -28,7 +28,7 @@ from lag_envs.leaderboard.audit import audit
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.site.build import build
-from lag_envs.leaderboard.standings import board_data
+from lag_envs.leaderboard.standings import page_data
 from lag_envs.leaderboard.submission import load
 from lag_envs.scores import known_returns
 from lag_envs.tasks import find, measured
@@ -159,7 +159,8 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 2)
-    submit.learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
+    learned = submit.learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
+    assert learned.code.endswith("/agents/ppo.py")
     for name in controllers(task):
         submit.controller(ID, name, tmp_path / name)
     board = Board(tmp_path / "board")
@@ -169,9 +170,10 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     board.publish("nonce", "https://example.org/pulse/1")
     finish(board)
     assert {entry.state for entry in board.read().entries.values()} == {"verified"}
-    data = board_data(board)
+    data = page_data(board)
     shown = next(env for env in data["environments"] if env["id"] == ID)
     assert shown["rows"][0]["name"] == "springs" and shown["goal"] == task.goal.text
+    assert shown["rows"][0]["module"] == task.controllers["springs"].place.partition(":")[0]
     replay = shown["rows"][0]["replays"][0]
     assert np.shape(replay["actions"])[1:] == (2,) and np.shape(replay["target"]) == (2,)
     findings = []

@@ -303,10 +303,11 @@ def test_agents_have_pages_and_news_are_fed():
 def test_submissions_are_linked_where_their_files_are_public():
     found = board_pages.data((incline.Brake.id,))
     row = found["environments"][0]["rows"][0]
-    row["id"] = "made/by hand"
-    link = 'href="https://example.org/main/leaderboard/submissions/made/by%20hand"'
-    assert any(link in text for text in render(found, source="https://example.org/main/")[0].values())
-    assert not any("leaderboard/submissions/made/by%20hand" in text for text in render(found)[0].values())
+    row |= {"id": "made/by hand", "module": "lag_envs.controllers.basic", "code": None}
+    main = "https://example.org/main/"
+    for link in ("leaderboard/submissions/made/by%20hand", "src/lag_envs/controllers/basic.py"):
+        assert any(f'href="{main}{link}"' in text for text in render(found, source=main)[0].values())
+        assert not any(link in text for text in render(found)[0].values())
 
 
 def test_frozen_boards_stand_apart():

@@ -54,6 +54,8 @@ class Architecture(ABC):
     arrays: dict[str, Shape]
     #: Whether it searches for a plan in each episode, see `protocol.PLANNED`.
     plans = False
+    #: The module with the agent's code; empty if its arrays say all.
+    module = ""
 
     @abstractmethod
     def __init__(self, env_id: str, table: Any) -> None: ...

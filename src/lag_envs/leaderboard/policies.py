@@ -105,6 +105,7 @@ class Controller(Architecture):
             raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown(table.name)}")
         found = known[table.name]
         self.build, self.plans = partial(build, self.task, table.name), found.plans
+        self.module = found.place.partition(":")[0]
         own: dict[str, Any] = {
             name: (Annotated[float, between(-1e6, 10.0 if name in PLANS else 1e6)], 0.0)
             for name, parameter in inspect.signature(resolve(found.place)).parameters.items()

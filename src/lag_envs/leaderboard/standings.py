@@ -33,7 +33,8 @@ def page_data(board: Board) -> dict[str, Any]:
         env["drives"] = drives.get(env["id"], [])
         for row in env["rows"]:
             middle, _ = shown_episodes(board.result(results[row["id"]]))
-            row["agent"] = agent(load(board.submission(row["id"])).policies[middle][1])
+            policy = load(board.submission(row["id"])).policies[middle][1]
+            row["agent"], row["module"] = agent(policy), policy.architecture.module
     return data
 
 
