@@ -35,6 +35,14 @@ def slow(*values: Any) -> Any:
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+def every(n: int, cases: Iterable[Any]) -> list[Any]:
+    """Mark all cases but the first, the n-th after it, and so on, as slow."""
+    return [
+        pytest.param(*(case if type(case) is tuple else [case]), marks=[pytest.mark.slow] * (i % n > 0))
+        for i, case in enumerate(cases)
+    ]
+
+
 @cache
 def features(kind: type[Task]) -> frozenset[str]:
     """Return the features of a task's record on which code depends, in words."""

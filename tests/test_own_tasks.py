@@ -39,7 +39,7 @@ def test_gymnasium_checker(id):
 
 
 @pytest.mark.parametrize("id", [slow(IDS[0]), *IDS[1:]])
-@pytest.mark.parametrize("n", [3, 70])
+@pytest.mark.parametrize("n", [3, slow(70)])
 def test_vector_is_single(id, n):
     single = gym.make_vec(id, num_envs=n, vectorization_mode="sync")
     native = gym.make_vec(id, num_envs=n)

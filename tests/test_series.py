@@ -17,7 +17,7 @@ import flint
 import numpy as np
 import pytest
 from contract_scenes import Trolley
-from covering import slow
+from covering import every, slow
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System
 
@@ -445,7 +445,7 @@ WITH_SUBSTEPS.append((Trolley(), [0.2, 0.1, 1.0, 9.0, -0.5, -8.0], [0.7, 0.2, 0.
 
 @pytest.mark.parametrize(
     ("scene", "state", "control"),
-    [case if i % 2 == 0 else slow(*case) for i, case in enumerate(WITH_SUBSTEPS)],
+    every(2, WITH_SUBSTEPS),
     ids=[*NAMES, "Trolley"],
 )
 def test_unfused_bits_are_those_of_plain_numbers(scene, state, control, monkeypatch):
@@ -643,7 +643,7 @@ def step_error(system, state, control, dt, order):
     return np.max(np.abs(errors) / scale) / max(1.0, np.linalg.norm(slopes, 2))
 
 
-@pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
+@pytest.mark.parametrize("system", every(2, SYSTEMS), ids=NAMES)
 def test_error_of_a_control_step(system):
     generator = np.random.default_rng(11)
     assert max(step_error(system, *system.draw(generator), 0.02, 16) for _ in range(2)) < 1e-12
@@ -702,7 +702,7 @@ def attempt_for(target, machine_code, fused, lanes):
     return parsed, machine_code.emit_assembly(parsed)
 
 
-@pytest.mark.parametrize("lanes", [1, 8])
+@pytest.mark.parametrize("lanes", [slow(1), 8])
 @pytest.mark.parametrize("fused", [False, True])
 @pytest.mark.parametrize(
     ("target", "features"),

@@ -760,7 +760,7 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
 @pytest.mark.parametrize(
     ("name", "scheme"),
     [
-        ("index", "light"),
+        slow("index", "light"),
         slow("PivotedBar-v0", "light"),
         ("PivotedBar-v0", "dark"),
         ("PivotedBar-v0-00000002", "dark"),
