@@ -22,7 +22,7 @@ from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import Policy, architecture
 from lag_envs.leaderboard.site.build import build
 from lag_envs.leaderboard.site.driving import agent, script_of, sliders
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum, pivoted_bar
+from lag_envs.tasks import TASKS, chain, cylinder_in_cylinder, incline, pendulum, pivoted_bar
 from tests import board_pages
 
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
@@ -606,7 +606,9 @@ def test_ghosts_run_beside(drive, haunted):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("id", ["PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.id])
+@pytest.mark.parametrize(
+    "id", ["PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.id, chain.SwingUpTriple.id]
+)
 def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
     """In at least one of three drives, for the machine may be busy; a ghost beside it looks a step ahead."""
     data = board_pages.data((id,), board_pages.AGENTS[:1])
@@ -616,7 +618,7 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
         axes = {"axis_0": np.linspace(-1, 1, 9), "axis_1": np.linspace(-2, 2, 9), "table": np.ones((9, 9))}
         data["environments"][0]["rows"][0]["agent"] = agent(Policy(architecture(id, table), axes))
     build(data, tmp_path)
-    assert any(np.quantile(frames(drive(id, folder=tmp_path), ghost), 0.95) <= 8.0 for _ in range(3))
+    assert any(np.quantile(frames(drive(id, folder=tmp_path), ghost), 0.99) <= 8.0 for _ in range(3))
 
 
 def frames(page, ghost):

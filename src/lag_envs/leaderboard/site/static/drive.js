@@ -474,6 +474,10 @@
 
   // --- the stage -------------------------------------------------------------------------------------------
 
+  /** Steps after which a browser has compiled a scene's code. */
+  const WARM = 300;
+  const idly = globalThis.requestIdleCallback?.bind(globalThis) ?? ((work) => setTimeout(work, 20));
+
   const LACKING = [
     ["numbers of 64 bits (BigInt)", typeof BigInt === "function"],
     ["drawing (canvas)", typeof CanvasRenderingContext2D === "function"],
@@ -606,6 +610,7 @@
         if (ghost.seed !== undefined) seed = ghost.seed;
       }
       restart();
+      if (ghost?.act) warmUp();
     }
 
     function chooseEpisode() {
@@ -662,6 +667,27 @@
       show(1);
     }
 
+    /**
+     * Play on a trial episode in the browser's idle time. A browser runs new code slowly at first, up to a hundred
+     * times, and compiles what it has often run; so a drive begins at full speed.
+     */
+    function warmUp() {
+      const [trial, act] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest)];
+      let steps = 0;
+      const more = () => {
+        if (running || me.steps) return; // an agent may remember what it saw since its episode began
+        const end = performance.now() + 2;
+        do {
+          if (trial.over) trial.restart(big(steps));
+          trial.step(act(trial));
+          trial.poses();
+          steps += 1;
+        } while (performance.now() < end);
+        if (steps < WARM) idly(more);
+      };
+      idly(more);
+    }
+
     function tick() {
       const key = rerunning ? rerunning.keys[me.steps] : hands.numbers();
       if (!key) {
@@ -697,9 +723,12 @@
       if (!running) return;
       left += Math.min(Math.max(time - before, 0), 100) / 1000 * Number(speed.value);
       before = time;
-      for (let n = 0; running && left >= about.dt && n < 6; n++) {
+      // Where the steps of a frame take too long, time runs slower instead of in jerks.
+      const end = performance.now() + 3;
+      while (running && left >= about.dt) {
         left -= about.dt;
         tick();
+        if (performance.now() > end) break;
       }
       if (left > about.dt) left = about.dt;
       show(running ? left / about.dt : 1);
@@ -1024,6 +1053,7 @@
 
     listGhosts();
     restart();
+    warmUp();
     const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
     tell(`${how ? `${how}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space starts.${nothing}`);
     if (calm.matches) speed.value = "0.5";
