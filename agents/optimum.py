@@ -35,6 +35,7 @@ from lag_envs.envs.model import Model
 from lag_envs.evaluation import statistics
 from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.host import machine
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.store import write
 from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task
@@ -364,7 +365,7 @@ def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
 def parameters(task: Task) -> dict[str, float]:
     """Return the numbers of a task's scene, its step [s] and the steps of an episode."""
     scene = task.scene
-    return {name: getattr(scene, name) for name in scene._numbers()} | {"dt": task.dt, "limit": task.limit}
+    return parameter_values(scene) | {"dt": task.dt, "limit": task.limit}
 
 
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.site.build import build
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import load
+from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.scores import known_returns
 from lag_envs.tasks import find, measured
 from tools.docs import environments
@@ -198,7 +199,7 @@ def toy():
 
 def test_it_is_recognised_as_a_driven_pendulum():
     scene = Pendulum(mass=0.7, length=0.4, damping=0.05)
-    drive = scene._form.coefficients([0.3, 1.0], [2.0], scene._constants())
+    drive = form_of(scene).coefficients([0.3, 1.0], [2.0], motion_constants_of(scene))
     per_torque = 1.0 / (0.7 * 0.4**2)
     assert drive == pytest.approx((9.81 / 0.4, 0.0, 0.05 * per_torque, 2.0 * per_torque, 0.0), rel=1e-15)
 

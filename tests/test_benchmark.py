@@ -24,6 +24,7 @@ from lag_envs.benchmark.results import quartiles, ratios, summary
 from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, has_own_flow, verdicts
 from lag_envs.scenes import CartPole
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import count_operations, record_block
 from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
@@ -393,7 +394,7 @@ def test_who_has_a_target():
     assert all(meant(target) for target in TARGETS) and not any(meant(target) for target in SERIES_TARGETS)
     assert not meant(TARGETS[1], num_envs=1) and not meant(TARGETS[1], library="gymnasium")
     unknown = [id for id, task in TASKS.items() if task.imperfections]
-    general = [id for id, task in TASKS.items() if task().scene._form is None]
+    general = [id for id, task in TASKS.items() if form_of(task().scene) is None]
     assert unknown and general and not any(has_own_flow(id) for id in (*unknown, *general, "Other-v0"))
     for target in SERIES_TARGETS:
         assert meant(target, library=ENERGIES, id=target.id) and not meant(target, id=target.id)

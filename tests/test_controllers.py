@@ -26,6 +26,7 @@ from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
+from lag_envs.scenes.derivation import form_of
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.registration import make_task
@@ -111,7 +112,7 @@ def observations():
         goal = 0.0 if task.target_range is None else task.target_range * rng.uniform(-1.0, 1.0, n)
         read = ObservationDecoder(task)
         k = SimpleNamespace(**task.formulas.constants())
-        form, goals = task.scene._form, [goal] * task.formulas.targets
+        form, goals = form_of(task.scene), [goal] * task.formulas.targets
 
         def seen(states):
             rows = form.lift(states) if form else tuple(states.T)

@@ -22,12 +22,14 @@ from lag_envs.envs.program import BLOCK
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import reference
 from lag_envs.leaderboard.standings import board_data
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report.docs import generated
 from lag_envs.report.environment_results import LARGEST_STEP
 from lag_envs.report.episodes import play, random_actions
 from lag_envs.report.reference import flow
 from lag_envs.report.report import SECTIONS
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, order_of
 from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, pivoted_bar
@@ -199,7 +201,7 @@ def test_equations(env_id, page):
     """The equations hold for the scene's accelerations, and the formula with numbers is the acceleration."""
     scene = make(env_id).scene
     head, *latex = re.findall(r"application/x-tex\">(.*?)</annotation>", page)
-    free = scene._layout.free
+    free = layout_of(scene).free
     assert head.startswith(r"\mathcal{L} = ") and all(one.endswith("= 0") for one in latex[: len(free)])
     state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
     found = {
@@ -216,7 +218,7 @@ def test_equations(env_id, page):
         assert stated == pytest.approx(found[free[0]], rel=1e-4)
         return
     assert len(latex) == len(free)
-    letters = {as_python(symbol(type(scene), name)): getattr(scene, name) for name in scene._numbers()}
+    letters = {as_python(symbol(type(scene), name)): getattr(scene, name) for name in parameter_names(scene)}
     values |= letters | {f"{name}_ddot": value for name, value in found.items()}
     for one in latex:
         left = as_python(one.removesuffix("= 0"))
@@ -253,7 +255,7 @@ def test_certified_speed(env_id, page):
     certified = task.certified_speed()
     order = scene.step_bound(task.centre, 0.0, task.dt).order
     if certified is None:  # a closed form, or a series that is certified when the step is known
-        assert stated is None and (not order or scene._form is None)
+        assert stated is None and (not order or form_of(scene) is None)
         return
     assert f"order {order}." in text
     assert stated[1] == f"{math.floor(10.0 * certified) / 10.0:.1f}"
@@ -265,7 +267,7 @@ def test_certified_speed(env_id, page):
     def bounds(speed):
         for u, rate in itertools.product(controls, (-fastest, 0.0, fastest)):
             state = [0.0] * len(scene.state_names)
-            state[scene._form.angle + 1] = speed
+            state[form_of(scene).angle + 1] = speed
             if fastest:
                 state[2] = rate
             yield scene.step_bound(state, u, task.dt)
@@ -275,7 +277,7 @@ def test_certified_speed(env_id, page):
     assert max(bound.substeps for bound in bounds(certified * (1.0 + 1e-9))) > 1
 
 
-@pytest.mark.parametrize("env_id", covering(i for i in PERFECT if TASKS[i]().scene._form))
+@pytest.mark.parametrize("env_id", covering(i for i in PERFECT if form_of(TASKS[i]().scene)))
 def test_measured_error(env_id):
     """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 
@@ -300,7 +302,7 @@ def test_measured_error(env_id):
         errors = [abs(float(a - b)) / size for a, b, size in zip(exact, after, sizes, strict=True)]
         grown = np.abs(scene.jacobian(before, control, env.task.dt)[0]) * sizes / sizes[:, None]
         attempts = scene.step_bound(before, control, env.task.dt).substeps
-        times = 1.0 if scene._form else attempts * max(1.0, grown.sum(axis=1).max())
+        times = 1.0 if form_of(scene) else attempts * max(1.0, grown.sum(axis=1).max())
         assert max(errors) < LARGEST_STEP * times
 
 
@@ -448,16 +450,16 @@ def test_speeds():
 
 def test_numbers_in_the_prose():
     """Statements on pages about the code's own numbers are true."""
-    weight = make(pivoted_bar.SwingUpFree.id).scene._constants()["alpha"]
+    weight = motion_constants_of(make(pivoted_bar.SwingUpFree.id).scene)["alpha"]
     doubling = math.log(2.0) / math.sqrt(weight)
     bar, brake = PivotedBar(), CylinderInCylinder(control="damping")
-    assert brake._order(0.02) == bar._order(0.031)
+    assert order_of(brake, 0.02) == order_of(bar, 0.031)
     said = {
         "docs/accuracy.md": [f"doubles an error every {doubling:.2f} s", "more than a million substeps"],
         "docs/numerics.md": [
             f"more than {pendulum.MAX_SUBSTEPS:,} substeps",
             f"blocks of {BLOCK} environments",
-            f"order is {bar._order(0.03)}, and {bar._order(0.031)} for steps above 0.03 s and where",
+            f"order is {order_of(bar, 0.03)}, and {order_of(bar, 0.031)} for steps above 0.03 s and where",
         ],
     }
     assert pendulum.MAX_SUBSTEPS == 1_000_000

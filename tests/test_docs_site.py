@@ -14,6 +14,7 @@ from browsers import serious
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES
 from lag_envs.tasks import TASKS
 from tools.docs import equations
@@ -159,7 +160,7 @@ def test_formulas_are_whole(site):
 
 def test_symbols_are_those_of_the_docstrings():
     for kind in SCENES:
-        symbols = [equations.symbol(kind, name) for name in kind()._numbers()]
+        symbols = [equations.symbol(kind, name) for name in parameter_names(kind())]
         assert len(set(symbols)) == len(symbols), kind
         assert not any("mathrm" in symbol for symbol in symbols), kind
 

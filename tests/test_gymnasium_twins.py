@@ -8,6 +8,7 @@ import pytest
 from rollouts import make
 
 from lag_envs.controllers import make_controller
+from lag_envs.mechanics.recording import parameter_names, parameter_values
 from lag_envs.report.gymnasium_peers import PEERS
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.cart_pole import CartPoleExact
@@ -34,9 +35,7 @@ def test_spaces_and_length_are_gymnasiums(env_id, peer_id):
 def test_scene_and_starts_are_gymnasiums(env_id, peer_id):
     task, theirs = TASKS[env_id](), gym.make(peer_id).unwrapped
     scene = PEERS[peer_id].scene(theirs)
-    assert {name: getattr(scene, name) for name in scene._numbers()} == {
-        name: getattr(task.scene, name) for name in scene._numbers()
-    }
+    assert parameter_values(scene) == {name: getattr(task.scene, name) for name in parameter_names(scene)}
     order = list(PEERS[peer_id].order)
     starts = []
     for seed in range(300):

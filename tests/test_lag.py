@@ -25,11 +25,12 @@ from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, TwoLinkArm
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.checks import SMALLEST_LAG
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.stepping import driver, general
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.driver import compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace, fading
-from lag_envs.stepping.lag import LaggedStepper
+from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
 from lag_envs.stepping.machine import Layout
 from lag_envs.stepping.series import REACH, Certificate, Plain, Series
 from lag_envs.stepping.tracing import evaluate
@@ -171,9 +172,9 @@ class Case(NamedTuple):
 
 
 def code_of(scene, fused=True):
-    constants = scene._constants(lagged=True)
+    constants = motion_constants_of(scene, lagged=True)
     absent = frozenset(name for name, value in constants.items() if value == 0.0)
-    code = scene._lagged.code(absent, fused)
+    code = lagged_stepper(scene.mechanics).code(absent, fused)
     return code, [constants[name.removeprefix("k_")] for name in code.constants]
 
 
@@ -300,7 +301,7 @@ def tails(case, lags, h, order):
     numbers |= {f"to_{x}": command for x, command in zip(names, case.command, strict=True)}
     oracle = oracle_of(case.twin(**numbers))
     found = oracle.coefficients(case.there(case.state, *case.applied), [], h, order + 20, 45)
-    free = case.scene._layout.free
+    free = layout_of(case.scene).free
     with mpmath.workdps(40):
         return [
             float(sum(abs(c) for c in of[name][order + more :]))
@@ -365,7 +366,7 @@ def test_lanes_of_a_block_have_the_bits_of_a_single_one():
     code, numbers = code_of(case.scene)
     layout, n = Layout(code.record), code.record.size
     stepper = LaggedStepper(case.scene.mechanics)
-    constants = case.scene._constants(lagged=True)
+    constants = motion_constants_of(case.scene, lagged=True)
     advance, xp = code.compile(), types.SimpleNamespace(where=lambda c, a, b: a if c else b)
     memory, alone = np.zeros((2 * layout.bounds + 1, BLOCK)), []
     for lane in range(30):
@@ -488,7 +489,7 @@ def test_environment_against_simulate(late):
         for h, wanted in ((late, sent), (dt - late, 5.0 * float(action[0]))):
             if h > 0.0:
                 k = types.SimpleNamespace(**numbers | {"dt": h})
-                (command,) = task.formulas.guarded(np, [wanted], scene._form.lift(state), k)
+                (command,) = task.formulas.guarded(np, [wanted], form_of(scene).lift(state), k)
                 state = scene.simulate(state, [command], h, lag=lag, applied=applied)[1]
                 applied, part = behind(applied, command, lag, h)
                 mean += part * h / dt

@@ -20,7 +20,7 @@ from lag_envs.mechanics.algebra import (
     substitute,
 )
 from lag_envs.scenes import Chain
-from lag_envs.stepping.general import code_of
+from lag_envs.stepping.general import series_code_of
 from lag_envs.stepping.lowering import Lowering
 
 PLACES = [Atom("place", name) for name in "abc"]
@@ -129,7 +129,7 @@ def products(record):
     "scene", [*(s.scene for s in SYSTEMS), Chain(bars=4)], ids=lambda s: type(s).__name__
 )
 def test_nothing_is_computed_twice_or_for_nothing(scene):
-    record = code_of(scene)[0].record
+    record = series_code_of(scene)[0].record
     assert len(set(record.nodes)) == len(record.nodes)
     used = {a for node in record.nodes for a in node.args} | {n for n, *_ in record.mass.values()}
     assert used | set(record.force) >= set(range(len(record.nodes)))

@@ -8,6 +8,7 @@ import pytest
 from covering import PERFECT, covering
 
 from lag_envs.report import conservation, leave_out
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks import TASKS
 
 
@@ -16,7 +17,7 @@ def claims(content):
 
 
 #: Those whose scene has a dedicated flow.
-FORMS = [id for id in TASKS if TASKS[id]().scene._form is not None]
+FORMS = [id for id in TASKS if form_of(TASKS[id]().scene) is not None]
 
 
 def task(id, **keywords):
@@ -102,7 +103,7 @@ def test_what_is_left_out_saves_operations():
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, problem in conservation.FREE.items() if problem.scene._form.angle is not None]
+    "name", [name for name, problem in conservation.FREE.items() if form_of(problem.scene).angle is not None]
 )
 def test_cosine_and_sine_stay_a_pair(name):
     """c² + s² does not grow; θ differs from the pair's angle only by its own accumulated roundings."""
@@ -123,7 +124,7 @@ def test_every_constant_changes_something(id):
     """Change each constant, by 1e-3 unless stated otherwise: the results of a start or step differ."""
     env = gym.make(id).unwrapped
     env.reset(seed=1)
-    program, rows, angle = env._program, env._rows.copy(), env.task.scene._form.angle
+    program, rows, angle = env._program, env._rows.copy(), form_of(env.task.scene).angle
     first, n = len(program.kept + program.scratch), len(program.y)
     rng = np.random.default_rng(2)
     starts = []

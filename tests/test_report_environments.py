@@ -18,6 +18,7 @@ from lag_envs.report.integrators import comparison
 from lag_envs.report.oracle import Oracle, oracle_of
 from lag_envs.report.runner import Result
 from lag_envs.report.stepped import Stepped
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS, cart_pole, cylinder_in_cylinder, incline, pivoted_bar
 
@@ -138,7 +139,7 @@ def test_one_second_of_every_environment(id):
     (row,) = environments.ours(id, seed=0, duration=min(1.0, 150 * TASKS[id].interval))
     assert row["seconds"] > 0.2
     assert row["disagreement"] < 1e-25
-    if TASKS[id]().scene._form is None:
+    if form_of(TASKS[id]().scene) is None:
         assert 0.0 < row["error"]["one step"] <= TOLERANCE and row["error"]["the end"] <= 1e-12
         return
     assert row["error"]["the end"] <= ONE_SECOND
@@ -148,7 +149,7 @@ def test_one_second_of_every_environment(id):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("id", [i for i in PERFECT if TASKS[i]().scene._form])
+@pytest.mark.parametrize("id", [i for i in PERFECT if form_of(TASKS[i]().scene)])
 def test_every_step_of_whole_episodes(id, seed):
     """README's statement on random actions; beside it long pushes that spin a bar round and round."""
     (row,) = environments.ours(id, seed)
@@ -157,7 +158,7 @@ def test_every_step_of_whole_episodes(id, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("id", [i for i in PERFECT if not TASKS[i]().scene._form])
+@pytest.mark.parametrize("id", [i for i in PERFECT if not form_of(TASKS[i]().scene)])
 def test_every_step_of_a_series(id):
     """The same for an episode's beginning: exact steps of these scenes take long."""
     duration = 100 * TASKS[id].interval

@@ -16,6 +16,7 @@ from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled
 from lag_envs.scenes import Scene, parameter
+from lag_envs.scenes.derivation import order_of
 
 COUNT = 3
 
@@ -116,7 +117,7 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
 def test_ours_is_what_simulate_does(name, together):
     """The timed code has the bits of `simulate`."""
     problems, _ = problem(name)
-    order = int(problems.scene._order(general_results.DT))
+    order = int(order_of(problems.scene, general_results.DT))
     found = (
         Certified(Certified.method_of(order), 1e-14).build(problems, general_results.DT, 1, together).end()
     )

@@ -21,6 +21,7 @@ from lag_envs.report.runner import Result
 from lag_envs.report.timing import Kernels
 from lag_envs.report.verdicts import OURS, TARGETS
 from lag_envs.report.work_precision import Series
+from lag_envs.scenes.derivation import form_of
 
 BAR = VARIANTS["PivotedBar"].scene()
 SERIES = [
@@ -509,5 +510,5 @@ def test_targets_are_compared_once():
 
 def test_series_are_only_measured_for_their_order():
     assert all(isinstance(s, Series) for s in work_precision.series(BAR))
-    flow = BAR._form.flow(0.02)
+    flow = form_of(BAR).flow(0.02)
     assert comparison("RK4", flow, True) is comparison("RK4", flow, True)

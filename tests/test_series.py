@@ -21,6 +21,7 @@ from covering import slow
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System
 
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import Chain, StepRefused
 from lag_envs.scenes.base import Scene, parameter
@@ -86,7 +87,7 @@ def sums(series, first):
 def stepper(scene: Scene, fused: bool = True):
     """Return the scene's stepper, its constants and its code."""
     found = SeriesStepper(scene.mechanics)
-    constants = found.constants({name: getattr(scene, name) for name in scene._numbers()})
+    constants = found.constants(parameter_values(scene))
     zero = frozenset(name for name, value in constants.items() if value == 0.0)
     return found, constants, found.code(zero, fused)
 
@@ -660,7 +661,7 @@ def test_error_of_many_control_steps(system, dt, order):
 @pytest.mark.parametrize("system", [SYSTEMS[1], SYSTEMS[5], SYSTEMS[7]], ids=lambda system: system.name)
 def test_jacobian_is_that_of_exact_steps(system):
     state, control = system.draw(np.random.default_rng(16), 0.5)
-    numbers = {name: getattr(system.scene, name) for name in system.scene._numbers()}
+    numbers = parameter_values(system.scene)
     tangent = stepper(system.scene)[0].tangent(numbers)
     found, refused = tangent.jacobian(np.array([state]), np.array([control]), 0.02, 16)
     expected = exact_slopes(system, state, control, 0.02)

@@ -20,6 +20,7 @@ import numpy as np
 
 import lag_envs  # noqa: F401 (registers the ids)
 from lag_envs.controllers import make_controller
+from lag_envs.mechanics.recording import parameter_values
 
 MODEL = Path("data/system_identification/identified_parameters/design_C.1/model_1.0/model_parameters.yml")
 #: The driven joint.
@@ -63,7 +64,7 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
     theirs.set_torque_limit(limits)
     plant = DoublePendulumPlant(model_pars=theirs)
     # Both motors and all friction: theirs compensates the idle joint's by its motor, ours leaves it out.
-    names = {name: getattr(env.scene, name) for name in env.scene._numbers()}
+    names = parameter_values(env.scene)
     whole = type(env.scene)(control="both", **(names | FRICTION))
 
     worst = accelerations(whole, plant)

@@ -93,8 +93,8 @@ class DeviceEnvs:
         self.task = sample.task
         kernels = kernels_of(self.task, dtype == torch.float32)
         self._launch = (load or load_nvrtc)(kernels.source, self.device, dtype == torch.float32)
-        self._limit = int(min(sample._constants[0]["limit"], ENDLESS))
-        self._shape = self.num_envs, *sample._actions.shape
+        self._limit = int(min(sample.limits[0], ENDLESS))
+        self._shape = self.num_envs, *(sample.single_action_space.shape or ())
         self._states = slice(0, len(self.task.formulas.state))
         self._targets, self._controls = kernels.targets, kernels.controls
         self.rows = self._new(kernels.kept, dtype=dtype).zero_()

@@ -205,7 +205,7 @@ class TorchVectorEnv:
         )
         if not isinstance(made, LagrangianVectorEnv):
             raise ValueError(f"{task} has no derivatives: it is no environment of this package")
-        if any(other is not made.task for other in made._tasks):
+        if any(other is not made.task for other in made.tasks):
             raise ValueError("gradients need the same parameters in all environments; give one value for all")
         _checked_task(made.task)
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
@@ -395,13 +395,14 @@ class _EnvStep(torch.autograd.Function):
         ctx.model, ctx.targets = env.model, envs.target
         ctx.set_materialize_grads(False)
         #: Environments that take a step, and those whose episode continues in the resulting state; None: all.
-        ctx.stepped = ctx.kept = envs._read("n") >= 0.0 if envs._over else None
+        ended = envs.ended
+        ctx.stepped = ctx.kept = None if ended is None else ~ended
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
         if (
             envs.autoreset_mode == AutoresetMode.SAME_STEP
-            and (ended := (terminated | truncated).numpy()).any()
+            and (over := (terminated | truncated).numpy()).any()
         ):
-            ctx.kept = ~ended
+            ctx.kept = ~over
         after = torch.from_numpy(envs.state)
         ctx.save_for_backward(state, actions, after)
         ctx.mark_non_differentiable(terminated, truncated)

@@ -21,6 +21,7 @@ from lag_envs.controllers import make_controller
 from lag_envs.report.episodes import random_actions
 from lag_envs.report.gymnasium_peers import PEERS, watch
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
 from tools.options import take_none
 
@@ -55,7 +56,7 @@ def balance(scene: Scene, states: Array, controls: Array) -> Array:
     The control is a constant force or torque on coordinates, independent of the state, so its work in a step
     is that force times their change.
     """
-    layout = scene._layout
+    layout = layout_of(scene)
     places = [layout.state.index(e) for e in layout.state if e.kind == "place"]
     zero, one = (np.array([float(u) for u in _forces(scene, u).values()]) for u in (0.0, 1.0))
     turned = np.diff(states[:, places], axis=0)

@@ -20,8 +20,10 @@ import numpy as np
 from lag_envs.envs.actions import Actions
 from lag_envs.envs.single import observation_space
 from lag_envs.leaderboard.docs import plain
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene
 from lag_envs.scenes.declaring import complete
+from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tables import markdown_table
@@ -294,7 +296,7 @@ def _derived(kind: type[Scene], choices: tuple[tuple[str, Any], ...]) -> tuple[s
 
 def derivation(scene: Scene) -> str:
     """Return a scene's Lagrangian and the equations of motion that follow from it."""
-    kind, symbols = type(scene), scene._numbers()
+    kind, symbols = type(scene), parameter_names(scene)
     choices = ((f.name, getattr(scene, f.name)) for f in parameters(kind) if f.name not in symbols)
     lagrangian, *motion = map(equations.mathml, _derived(kind, tuple(choices)))
     return "\n\n".join(["The Lagrangian, T - V:", lagrangian, "and the equations of motion:", *motion])
@@ -302,7 +304,7 @@ def derivation(scene: Scene) -> str:
 
 def _equations(task: Task) -> str:
     text = derivation(task.scene)
-    if len(task.scene._layout.free) == 1:
+    if len(layout_of(task.scene).free) == 1:
         numbers = equations.mathml(equations.with_numbers(task.scene))
         text += f"\n\nWith the default parameters, in SI units:\n\n{numbers}"
     return text
@@ -318,14 +320,14 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
     speed, texts = task.certified_speed(), []
     if speed is not None and speed >= 0.0:
         order = task.scene.step_bound(task.centre, task.limit_control, task.dt).order
-        rate = f"{task.scene._layout.free[0]}_dot"
+        rate = f"{layout_of(task.scene).free[0]}_dot"
         texts.append(
             f"Stepped by a Taylor series of order {order}. One series per step is certified to have a "
             f"truncation error of at most 1e-12 rad/s as long as |`{rate}`| is at most "
             f"{math.floor(10.0 * speed) / 10.0:.1f} rad/s, whatever the control. Above that, the step is "
             "divided by the same bound."
         )
-    if task.scene._form is None:
+    if form_of(task.scene) is None:
         texts.append(
             "Stepped by Taylor series. Each comes with a proved bound on its truncation error: at most "
             f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. If that does not help, for "

@@ -6,6 +6,7 @@ import inspect
 import re
 import sys
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES, Scene
 from lag_envs.tables import markdown_table
 from tools.docs.environments import derivation, parameters
@@ -42,7 +43,7 @@ def _scene(kind: type[Scene]) -> list[str]:
     scene, words = kind(), described(kind)
     rows = []
     for field in parameters(kind):
-        letter = mathml(symbol(kind, field.name), block=False) if field.name in scene._numbers() else ""
+        letter = mathml(symbol(kind, field.name), block=False) if field.name in parameter_names(scene) else ""
         default = cell(getattr(scene, field.name))
         rows.append(
             [f"`{field.name}`", letter, default, field.metadata.get("unit", ""), words.get(field.name, "")]

@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 
@@ -40,7 +41,7 @@ def divisions(ids: Sequence[str]) -> list[dict[str, Any]]:
 def _divided(env_id: str) -> dict[str, Any]:
     envs: Any = gym.make_vec(env_id, BATCH, autoreset_mode="SameStep").unwrapped
     scene, dt, limit = envs.scene, envs.task.dt, int(envs.task.limit)
-    fast = [i for i, entry in enumerate(scene._layout.state) if entry.kind != "place"]
+    fast = [i for i, entry in enumerate(layout_of(scene).state) if entry.kind != "place"]
     envs.reset(seed=0)
     envs.action_space.seed(0)
     parts: list[int] = []

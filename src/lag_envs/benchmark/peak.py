@@ -15,6 +15,8 @@ import numpy as np
 
 from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import CORE, Contestant
+from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
 from lag_envs.stepping.compiling import compile_function, count_operations
@@ -68,7 +70,10 @@ def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
     largest = {r.id: r for r in sorted(batches, key=lambda r: r.num_envs)}
     found = []
     for id, row in largest.items():
-        count = products(gym.make_vec(id, num_envs=1)._program) if row.rates else None  # type: ignore[attr-defined]
+        count = None
+        if row.rates:
+            task: Any = gym.make_vec(id, num_envs=1).unwrapped.task  # type: ignore[attr-defined]
+            count = products(program_of(task, [numbers_of(task)]))
         if count and (pairs := ratios(row.rates, limits)):
             share = quartiles([count * pair for pair in pairs])
             found.append({"id": id, "num_envs": row.num_envs, "products": count, "share": share})

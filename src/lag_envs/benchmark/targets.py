@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from lag_envs.benchmark.results import quartiles
 from lag_envs.benchmark.rounds import ENERGIES
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks import TASKS
 
 
@@ -56,7 +57,7 @@ COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 @cache
 def has_own_flow(env_id: str) -> bool:
     """Tell whether an environment is stepped by its scene's dedicated flow alone."""
-    return env_id in TASKS and not TASKS[env_id].imperfections and TASKS[env_id]().scene._form is not None
+    return env_id in TASKS and not TASKS[env_id].imperfections and form_of(TASKS[env_id]().scene) is not None
 
 
 def reached(rows: Sequence[dict[str, Any]], target: SpeedTarget) -> dict[str, float]:

@@ -6,6 +6,7 @@ import argparse
 
 from lag_envs.commands.base import OWN, Command, count, known, task_of
 from lag_envs.own_files import is_file
+from lag_envs.scenes.derivation import order_of
 
 
 def declare_order(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +31,7 @@ def run_order(args: argparse.Namespace) -> int:
         kind = type(task_of(known(args.id)))
     with progress(args.rounds * len(ORDERS)) as advance:
         times = measure(kind, args.num_envs, args.rounds, advance=lambda: advance(kind.__name__))
-    print("\n".join(lines(kind, times, kind().scene._order(kind().dt))))
+    print("\n".join(lines(kind, times, order_of(kind().scene, kind().dt))))
     return 0
 
 

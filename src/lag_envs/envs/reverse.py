@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.envs.program import constants_of
+from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import pulled
 from lag_envs.stepping.adjoint import Differentiable, Lanes
 from lag_envs.stepping.flows import split
@@ -62,7 +63,7 @@ class Reverse:
         sizes |= {"own_y": sizes["y"], "own_u": sizes["u"], "own_g": sizes["g"], "own_p": len(parameters)}
         sizes |= {"moved": sizes["y"] + sizes["u"] + len(parameters)}
         self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
-        self._form = task.scene._form
+        self._form = form_of(task.scene)
         self._compiled: dict[str, Lanes] = {}
 
     def observations(self, states: Array, targets: Array) -> Array:
@@ -192,7 +193,7 @@ class Reverse:
 
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
         """Record the way back through the whole step: cotangents of y, a, g, no parameters; 1 if ordinary."""
-        stepper: Any = self._task.scene._code(self._task.dt)
+        stepper: Any = code_of(self._task.scene, self._task.dt)
         (u,) = self._control_of(xp, k, y, a, g)
         own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
         moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])

@@ -45,13 +45,14 @@ from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.program import DRAWS
 from lag_envs.envs.single import key_of
 from lag_envs.mechanics.algebra import FormulaError, evaluate
-from lag_envs.mechanics.recording import parameter
+from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import ORDER
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.scenes.shapes import Frame
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split
-from lag_envs.stepping.general import usual_order
+from lag_envs.stepping.general import stepper_of, usual_order
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.stepping.tracing import Number
@@ -124,22 +125,22 @@ class UnfusedProgram:
                 "scripts lack; switch them off with None, as in observation_noise=None"
             )
         self.task, formulas, scene = task, task.formulas, task.scene
-        self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
+        self._formulas, self._form, self._stepper = formulas, form_of(scene), stepper_of(scene.mechanics)
         own = formulas.constants()
-        scenes = scene._constants()
+        scenes = motion_constants_of(scene)
         self.given = {name: value for name, value in own.items() if name not in scenes and name != "x"}
         self.given["strength"] = 1.0
         fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
         #: Parameters that are computed from others, and how.
         self.made = {
             name: fields[name]
-            for name in scene._numbers()
+            for name in parameter_names(scene)
             if fields[name] is not None and fields[name](scene) == getattr(scene, name)
         }
         expressions = self._stepper.expressions()
         self._motion = {f"motion_{name}": e for name, e in expressions.items()}
         # Functions of parameters must have the same bits everywhere, too.
-        parameters, functions = {n: getattr(scene, n) for n in scene._numbers()}, ElementaryTrace()
+        parameters, functions = parameter_values(scene), ElementaryTrace()
         motion = self._stepper.constants(parameters, functions)
         gone = frozenset(name for name, value in motion.items() if value == 0.0)
         self.derived = self._form.constants(parameters, functions) if self._form else {}
@@ -153,7 +154,8 @@ class UnfusedProgram:
         self._order, self._tolerance = (order // 2, SINGLE_TOLERANCE) if single else (order, TOLERANCE)
         self.states = len(formulas.state)
         self._width = self._form.width if self._form else self.states
-        self._turned = len([n for n in scene._layout.left_out if n in scene._layout.names])
+        layout = layout_of(scene)
+        self._turned = len([n for n in layout.left_out if n in layout.names])
         sizes = (self._width, formulas.targets, formulas.controls, len(formulas.observation), self._turned)
         ends = np.cumsum((0, *sizes)).tolist()
         self.size = ends[-1] + 3
@@ -250,7 +252,7 @@ class UnfusedProgram:
         return t.formula(recorded, inputs | self._k)
 
     def _derive(self, t: Script) -> None:
-        names = self.task.scene._numbers()
+        names = parameter_names(self.task.scene)
         known: dict[str, Any] = {n: self._place[f"self_{n}"] for n in names if n not in self.made}
         for name, made in self.made.items():
 
@@ -283,7 +285,7 @@ class UnfusedProgram:
 
     def _moved_starts(self) -> list[str]:
         """Return the start's constants that follow from parameters, if plain arithmetic computes them."""
-        names = list(self.task.scene._numbers())
+        names = list(parameter_names(self.task.scene))
         try:
             found = self._formulas.starts_of(dict(zip(names, ElementaryTrace().inputs(*names), strict=True)))
         except FormulaError:
@@ -387,7 +389,7 @@ class UnfusedProgram:
         ) -> list:
             of = self.task
             if own:
-                of = self._formulas._self(k)
+                of = self._formulas.with_numbers(k)
                 of.formulas = self._formulas  # not the formulas of recorded numbers
             found = picture.poses_of(of, Frame(y, u, of.share(list(u)), list(g), turned), xp)
             return [x for pose in found.values() for x in pose]

@@ -33,6 +33,7 @@ from lag_envs.envs.single import (
 )
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -123,8 +124,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.diagnostics = diagnostics
         #: TorchRL expects this name, which Gymnasium's own vector environments use.
         self.autoreset_mode = check_mode(autoreset_mode)
-        self._tasks = make_tasks(load_task(task), self.num_envs, options)
-        self.task = self._tasks[0]
+        #: The task of each environment; they differ only in numbers.
+        self.tasks = make_tasks(load_task(task), self.num_envs, options)
+        self.task = self.tasks[0]
         self.scene = self.task.scene
         self.__doc__ = self.task.__doc__
         self.metadata = {
@@ -134,12 +136,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         }
         self._actions = Actions(self.task.formulas)
         self.single_action_space = self._actions.space
-        self.single_observation_space = observation_space(self._tasks)
+        self.single_observation_space = observation_space(self.tasks)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
-        numbers = {id(task): numbers_of(task) for task in {id(t): t for t in self._tasks}.values()}
-        self._constants = [dict(numbers[id(task)]) for task in self._tasks]
+        numbers = {id(task): numbers_of(task) for task in {id(t): t for t in self.tasks}.values()}
+        self._constants = [dict(numbers[id(task)]) for task in self.tasks]
         endless = type(max_episode_steps) is int and max_episode_steps == -1  # Gymnasium's word for it
         if max_episode_steps is not None and not endless:
             steps = float(check_count("max_episode_steps", max_episode_steps))
@@ -212,13 +214,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         lanes = self._lanes[mask]
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
-            state = np.array([named(i, self._tasks[i].start_state, state[i]) for i in lanes])
+            state = np.array([named(i, self.tasks[i].start_state, state[i]) for i in lanes])
         if target is not None:
             many = self.task.formulas.targets
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
-            target = np.array(
-                [np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes]
-            )
+            target = np.array([np.atleast_1d(named(i, self.tasks[i].check_target, target[i])) for i in lanes])
         if not self._started and not mask.all():
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
@@ -388,7 +388,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         """The properties that a snapshot must share."""
         options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
         limit = self._constants[0]["limit"]
-        return snapshots.about(self._tasks, **options, max_episode_steps=limit, order=self.order)
+        return snapshots.about(self.tasks, **options, max_episode_steps=limit, order=self.order)
 
     # --- for inspection ------------------------------------------------------------------------------------
 
@@ -435,7 +435,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         The order changes only the speed: each step is certified to the same tolerance with any order.
         """
-        return None if self.scene._form else int(self._pars[0][self._program.uniform.index("x")])
+        return None if form_of(self.scene) else int(self._pars[0][self._program.uniform.index("x")])
 
     @order.setter
     def order(self, value: int) -> None:
@@ -458,7 +458,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         from lag_envs.envs.html import described, still
         from lag_envs.envs.rendering import columns_of, tiled
 
-        shown, pictures = self._tasks[:9], []
+        shown, pictures = self.tasks[:9], []
         columns = columns_of(len(shown))
         targets = self.target if self._started and self.target is not None else [None] * self.num_envs
         for i, task in enumerate(shown):
@@ -477,8 +477,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         size = (WIDTH, HEIGHT) if self._tiles is None else tile_size(self._tiles)
         return tuple(
-            Viewer(task, "rgb_array", self._look, size)
-            for task in self._tasks[: self._tiles or self.num_envs]
+            Viewer(task, "rgb_array", self._look, size) for task in self.tasks[: self._tiles or self.num_envs]
         )
 
     def _use_drawn(self) -> None:
@@ -489,13 +488,23 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                 values = {name: float(column[i]) for name, column in drawn.items()}
                 if self._viewed.get(i) != values:
                     self._viewed[i] = values
-                    viewer.use(self._tasks[i].varied(**values))
+                    viewer.use(self.tasks[i].varied(**values))
 
     def _count(self, rewards: NDArray[np.float64]) -> None:
         """Count steps and rewards of the episodes."""
         begun = self._read("n") == 0.0
         self._steps = np.where(begun, 0, self._steps + 1)
         self._totals = np.where(begun, 0.0, self._totals + rewards)
+
+    @property
+    def ended(self) -> NDArray[np.bool_] | None:
+        """The environments whose episodes are over, as a mask; None if there are none."""
+        return self._read("n") < 0.0 if self._over else None
+
+    @property
+    def limits(self) -> NDArray[np.float64]:
+        """Steps of an episode in each environment; infinity for one without an end."""
+        return np.array([constants["limit"] for constants in self._constants])
 
     def _read(self, row: str) -> NDArray[np.float64]:
         return self._blocks[:, self._row[row]].reshape(-1)[: self.num_envs].copy()
@@ -563,7 +572,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         states, controls = self.state, self.control
         drawn = self.parameters
         for i in self._lanes[mask]:
-            task = self._tasks[i]
+            task = self.tasks[i]
             if drawn:
                 task = task.varied(**{name: float(values[i]) for name, values in drawn.items()})
             infos = self._add_info(infos, diagnostics(task.scene, states[i], controls[i]), int(i))
@@ -572,7 +581,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
         control = self.control[i]
-        error = self._tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
+        error = self.tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
         error.results = results
         return error
 

@@ -16,7 +16,7 @@ from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative, substitute
 from lag_envs.mechanics.equations import Energies, Equations, derive, place, velocity
 from lag_envs.mechanics.layout import Layout, Prescribed
-from lag_envs.mechanics.recording import Record, control, parameter
+from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +195,7 @@ def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection
     of = type(scene).__name__
     zero = {
         parameter(name): Expr.of(0)
-        for name in scene._numbers()
+        for name in parameter_names(scene)
         if getattr(scene, name) == 0.0
         and name not in varying
         and any(_is_hard(e, name) for e in found.exprs())

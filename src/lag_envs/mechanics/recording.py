@@ -101,6 +101,17 @@ class Values:
         return f"<{self._what}s {', '.join(self._items)}>"
 
 
+def parameter_names(scene: Any) -> tuple[str, ...]:
+    """Return the names of a scene's parameters that have a value."""
+    fields = dataclasses.fields(scene)
+    return tuple(f.name for f in fields if "unit" in f.metadata and getattr(scene, f.name) is not None)
+
+
+def parameter_values(scene: Any) -> dict[str, Any]:
+    """Return a scene's parameters that have a value, by name."""
+    return {name: getattr(scene, name) for name in parameter_names(scene)}
+
+
 def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     """Return an object like the scene whose parameters are other numbers, or symbols.
 
@@ -111,7 +122,7 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     numbers : mapping
         A number for each parameter that is not None.
     """
-    other, given = object.__new__(type(scene)), scene._numbers()
+    other, given = object.__new__(type(scene)), parameter_names(scene)
     for field in dataclasses.fields(scene):
         value = numbers[field.name] if field.name in given else getattr(scene, field.name)
         object.__setattr__(other, field.name, value)
@@ -121,7 +132,7 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
 
 def symbolic_twin(scene: Any) -> Any:
     """Return an object like the scene whose parameters are recorded numbers."""
-    return twin(scene, {name: Expr.of(parameter(name)) for name in scene._numbers()})
+    return twin(scene, {name: Expr.of(parameter(name)) for name in parameter_names(scene)})
 
 
 @dataclasses.dataclass(frozen=True)

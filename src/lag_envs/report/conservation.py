@@ -17,6 +17,7 @@ from lag_envs.report.runner import Job, Result, Row
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import motion_constants_of
 from lag_envs.stepping.compiling import compile_function
 
 if TYPE_CHECKING:
@@ -46,7 +47,8 @@ class Free(NamedTuple):
 
 _BAR = PivotedBar(track=None)
 _SHELL = CylinderInCylinder(control="damping")
-_TOP = 2.0 * math.sqrt(_BAR._constants()["alpha"])  #: speed at the bottom that reaches the top [rad/s]
+#: Speed at the bottom that reaches the top [rad/s].
+_TOP = 2.0 * math.sqrt(motion_constants_of(_BAR)["alpha"])
 
 FREE = {
     "bar, 0.1 rad": Free(_BAR, (0.1, 0.0)),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lag_envs.report.content import Claim, Content, Picture, Table
 from lag_envs.report.episodes import DIGITS, TIMES
 from lag_envs.report.runner import Result, Row
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS
 
@@ -112,7 +113,7 @@ def _ratio(row: Row) -> float:
 
 def _is_general(row: Row) -> bool:
     """Tell whether an environment of ours is stepped by the general series."""
-    return TASKS[row["case"]]().scene._form is None
+    return form_of(TASKS[row["case"]]().scene) is None
 
 
 def _share(row: Row) -> float:

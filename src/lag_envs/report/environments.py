@@ -31,6 +31,7 @@ from lag_envs.report.episodes import (
 )
 from lag_envs.report.gymnasium_peers import PEERS, measure, random_episode, watch
 from lag_envs.report.runner import Job, Row
+from lag_envs.scenes.derivation import order_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.pivoted_bar import SwingUpFree
 
@@ -106,7 +107,7 @@ def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) 
                 for a, b in zip(x, y, strict=True)
             )
         )
-    order = task.scene._order(task.dt)
+    order = order_of(task.scene, task.dt)
     row |= {
         "ours": True,
         "integrator": f"Taylor series, order {order}" if order else "exact flow",

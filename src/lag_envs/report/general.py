@@ -28,7 +28,8 @@ from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Row, describe
 from lag_envs.report.timing import Sample, interleaved
-from lag_envs.stepping.general import code_of
+from lag_envs.scenes.derivation import order_of
+from lag_envs.stepping.general import series_code_of
 
 __all__ = ["certified", "content", "errors", "jobs", "measured", "shares"]
 
@@ -239,7 +240,7 @@ def certificate(name: str, count: int) -> Iterator[Row]:
 
 def certified(scene: Any, states: Array, controls: Array, dt: float, order: int) -> tuple[list[int], Array]:
     """Return each step's attempts, not positive if it was refused, and the largest bound of any step."""
-    code, numbers = code_of(scene)
+    code, numbers = series_code_of(scene)
     attempts, bounds = [], []
     for state, held in zip(states.tolist(), controls.tolist(), strict=True):
         status, found = code.bounded(state, held, dt, order, numbers)
@@ -296,7 +297,7 @@ def _heyoka(system: System, mode: str) -> float:
     switch(False)
     try:
         begin = process_time()
-        Heyoka("Taylor", 1e-15)._integrator(problems.equation, width)
+        Heyoka("Taylor", 1e-15).integrator(problems.equation, width)
         return process_time() - begin
     finally:
         switch(True)
@@ -336,9 +337,9 @@ def _path(scene: Any, start: Array, steps: int, tolerance: float | None) -> Arra
     """Return a trajectory without control, certified to a tolerance."""
     if tolerance is None:
         return scene.simulate(start, np.zeros(steps), DT)
-    code, numbers = code_of(scene)
+    code, numbers = series_code_of(scene)
     path = np.empty((steps + 1, len(start)))
     path[0] = start
-    if code.compile_simulate(tolerance)(path, np.zeros((steps, 1)), DT, float(scene._order(DT)), *numbers):
+    if code.compile_simulate(tolerance)(path, np.zeros((steps, 1)), DT, float(order_of(scene, DT)), *numbers):
         raise ArithmeticError("a step was refused")
     return path

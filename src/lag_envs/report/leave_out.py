@@ -18,6 +18,7 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import Kernels, at_once, interleaved
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.tasks.base import Task
 
@@ -94,7 +95,7 @@ def jobs(quick: bool) -> list[Job]:
 def terms() -> Iterator[Row]:
     """Yield the contents of the compiled step of every environment with a dedicated flow."""
     for id, task in TASKS.items():
-        if task().scene._form is not None:
+        if form_of(task().scene) is not None:
             yield {"kind": "terms", "id": id} | carried(task())
 
 

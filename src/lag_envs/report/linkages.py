@@ -26,6 +26,7 @@ from lag_envs.report.peers import Peer
 from lag_envs.report.timing import Sample
 from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 
 Array = NDArray[np.float64]
 #: Inertia about a rod's own axis where it has none: MuJoCo requires a positive one [kg m²].
@@ -88,9 +89,9 @@ class System:
         rng = np.random.default_rng(seed)
         states = np.zeros((count, len(self.scene.state_names)))
         controls = np.zeros((count, 1))
-        free = self.scene._layout.free
+        free = layout_of(self.scene).free
         for j in range(count):
-            for i, entry in enumerate(self.scene._layout.state):
+            for i, entry in enumerate(layout_of(self.scene).state):
                 if entry.coordinate in free:
                     widths = self.places if entry.kind == "place" else self.speeds
                     states[j, i] = rng.uniform(-1, 1) * widths[free.index(entry.coordinate)]

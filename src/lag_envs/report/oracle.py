@@ -158,7 +158,7 @@ _known: dict[Any, Equations] = {}
 
 def equations_of(scene: Scene) -> Equations:
     """Return a scene's equations, derived once for all scenes that differ only in numbers."""
-    numbers = tuple(scene._numbers())
+    numbers = symbolic.parameter_names(scene)
     fields = [f.name for f in dataclasses.fields(scene)]  # type: ignore[arg-type]
     key = type(scene), repr([(name, getattr(scene, name)) for name in fields if name not in numbers]), numbers
     if key not in _known:
@@ -279,7 +279,7 @@ class Oracle:
     def __init__(self, scene: Scene, numbers: Mapping[str, Any] = MappingProxyType({})) -> None:
         self.equations = equations_of(scene)
         self.names = self.equations.names
-        values = {name: getattr(scene, name) for name in scene._numbers()} | dict(numbers)
+        values = {name: getattr(scene, name) for name in symbolic.parameter_names(scene)} | dict(numbers)
         symbols = {symbol for e in (*self.equations.mass, *self.equations.force) for symbol in e.free_symbols}
         symbols |= {symbol for e in self.equations.coupling for symbol in e.free_symbols}
         self._values = {s: sympy.Rational(values[s.name]) for s in symbols if s.name in values}

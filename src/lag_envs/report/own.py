@@ -32,6 +32,7 @@ from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.scenes.derivation import order_of
 
 SECTION = "own"
 #: Numbers of states with exact ends, and of states for the certificate; then the same for a quick look.
@@ -182,7 +183,7 @@ def jobs(quick: bool, file: str = "") -> list[Job]:
 def steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
     """Yield errors of steps as shipped beside their bounds, and the share certified as a whole."""
     s = subject(file, name)
-    order = s.scene._order(s.dt)
+    order = order_of(s.scene, s.dt)
     starts, controls = s.draw(SOME if quick else MANY, seed=1)
     attempts, bounds = general.certified(s.scene, starts, controls, s.dt, order)
     kept = bounds[np.array(attempts) > 0]

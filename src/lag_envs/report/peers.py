@@ -185,7 +185,7 @@ class Heyoka(Peer):
         import heyoka
 
         width = heyoka.recommended_simd_size() * (1 if self.method == self.NARROW else 2) if together else 1
-        integrator = self._integrator(problems.equation, width)
+        integrator = self.integrator(problems.equation, width)
         size, count, span = problems.equation.size, len(problems), dt * steps
         start, p = blocks(problems.y[:size], width), blocks(problems.p, width)
         rows = start.copy()
@@ -221,7 +221,8 @@ class Heyoka(Peer):
         integrator.propagate_until(span)
         block[:] = integrator.state.reshape(block.shape)
 
-    def _integrator(self, equation: Equation, width: int) -> Any:
+    def integrator(self, equation: Equation, width: int) -> Any:
+        """Compile heyoka's integrator for vectors of this width."""
         import heyoka
 
         names = heyoka.make_vars(*(f"y{i}" for i in range(equation.size)))

@@ -27,6 +27,7 @@ from lag_envs.report.stability_results import (
 )
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.scenes.derivation import motion_constants_of
 
 __all__ = ["cases", "cells", "content", "jobs", "march", "methods", "outcomes"]
 
@@ -193,7 +194,7 @@ def march(
         Precision of everything: constants, state, arithmetic.
     """
     scene = Stepped(found[0].scene)
-    constants = [case.scene._constants() for case in found]
+    constants = [motion_constants_of(case.scene) for case in found]
     k = SimpleNamespace(**{key: np.array([c[key] for c in constants], dtype) for key in constants[0]})
     u = np.array([case.control for case in found], dtype)
     h = (dt / counts).astype(dtype)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lag_envs.report.cases import Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import motion_constants_of
 from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import Flow
 
@@ -57,7 +58,7 @@ class Kernels:
 
     def arguments(self, scene: Scene, dt: float) -> tuple[float, ...]:
         """Return the arguments of the compiled functions after states and controls."""
-        constants = scene._constants()
+        constants = motion_constants_of(scene)
         present = [name for name, value in constants.items() if value != 0.0]
         if present != self._names:
             raise ValueError(f"compiled for the constants {self._names}, got {present}")

@@ -9,6 +9,8 @@ from html import escape
 from importlib.util import find_spec
 from typing import Any
 
+from lag_envs.scenes.derivation import layout_of
+
 #: Operations of a Lagrangian up to which its equations of motion are written out.
 LONGEST = 150
 
@@ -61,8 +63,8 @@ def _equations(scene: Any) -> str:
         return "".join([*found, f"<p>Its equations of motion are long: {code}</p>"])
     found.append("<p>Equations of motion</p>")
     q = symbolic.motion(scene)[0]
-    rates = [q[name].diff(symbolic.t, 2) for name in scene._layout.names]
-    for name in scene._layout.free:
+    rates = [q[name].diff(symbolic.t, 2) for name in layout_of(scene).names]
+    for name in layout_of(scene).free:
         equation = sympy.expand(symbolic.euler_lagrange(scene, name))
         squares = {
             power: 1 - sympy.cos(power.base.args[0]) ** 2

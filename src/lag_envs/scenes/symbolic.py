@@ -16,7 +16,8 @@ import sympy
 from sympy.core.function import AppliedUndef
 
 from lag_envs.mechanics.algebra import FormulaError, Functions
-from lag_envs.mechanics.recording import Values, twin
+from lag_envs.mechanics.recording import Values, parameter_names, twin
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.parameters import parameter
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def symbolic(scene: Scene) -> Any:
     """Return a twin of the scene whose parameters are symbols with their names."""
     ranges = {f.name: f.metadata for f in dataclasses.fields(scene)}  # type: ignore[arg-type]
     symbols = {}
-    for name in scene._numbers():
+    for name in parameter_names(scene):
         positive = any(
             ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least")
         )
@@ -75,7 +76,7 @@ def symbolic(scene: Scene) -> Any:
 
 def motion(scene: Scene) -> tuple[Values, Values, Values]:
     """Return places, velocities and controls as SymPy's functions of time."""
-    layout = scene._layout
+    layout = layout_of(scene)
     q: dict[str, Any] = {name: sympy.Function(name, real=True)(t) for name in layout.names}
     u = {name: sympy.Function(name, real=True)(t) for name in layout.controls}
     return (
@@ -89,7 +90,7 @@ def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
     """Return an expression with resting coordinates at their resting places."""
     values: dict[Any, Any] = {}
     rests = symbolic(scene).rests()
-    for p in scene._layout.at("rest"):
+    for p in layout_of(scene).at("rest"):
         place = sympy.Function(p.name, real=True)(t)
         values |= {place: xp.rational(rests.get(p.name, 0)), place.diff(t): 0, place.diff(t, 2): 0}
     return expression.xreplace({key: sympy.sympify(value) for key, value in values.items()})
@@ -126,7 +127,7 @@ def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.E
 
 def equations(scene: Scene) -> list[sympy.Eq]:
     """Return the equations of motion of the free coordinates; `sympy.latex` prints them."""
-    return [sympy.Eq(sympy.simplify(euler_lagrange(scene, name)), 0) for name in scene._layout.free]
+    return [sympy.Eq(sympy.simplify(euler_lagrange(scene, name)), 0) for name in layout_of(scene).free]
 
 
 # --- expressions as a scene --------------------------------------------------------------------------------

@@ -16,16 +16,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.mechanics.recording import Values, formula, twin
+from lag_envs.mechanics.recording import Values, formula, parameter_names, twin
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused, check_number, check_state, real_array
 from lag_envs.scenes.declaring import ORDER, complete
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of, structure_of
 from lag_envs.scenes.door import is_own
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
 from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
+from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
@@ -309,10 +311,11 @@ class Task:
         pendulum.Coefficients, slope.FixedSlope or slope.TurningSlope
             See `lag_envs.stepping.normal_forms`. In a formula they are those that the step uses.
         """
-        form = self.scene._form if self._recording is None else self._recording.form
+        recorded = self._recording
+        form = form_of(self.scene) if recorded is None else recorded.form
         if form is None:
             raise FormulaError(f"{type(self.scene).__name__} has no normal form; use its energies")
-        k = SimpleNamespace(**self.scene._constants()) if self._recording is None else self._recording.k
+        k = SimpleNamespace(**motion_constants_of(self.scene)) if recorded is None else recorded.k
         return form.drive(list(state), list(control), k, xp)
 
     #: While formulas are recorded, the recorded constants.
@@ -350,7 +353,8 @@ class Task:
         It is below 0 if one series is never enough, and None if the scene is not a driven pendulum. See
         `NormalForm.certified_speed`.
         """
-        form, k = self.scene._form, self.scene._constants()
+        form: Any = form_of(self.scene)
+        k = motion_constants_of(self.scene)
         if form is None:
             return None
         found = [form.certified_speed(y, u, self.dt, k) for y in self.edges for u in self.control_range]
@@ -397,9 +401,9 @@ class Task:
     @property
     def variant(self) -> tuple:
         """What determines the code besides the class: the environments of a batch must agree in it."""
-        scene, form = self.scene, self.scene._form
+        scene, form = self.scene, form_of(self.scene)
         order = form.order(self.dt) if form else 0
-        return *scene._structure[1:3], scene.mechanics.zeros, order, self.fixed_target is None
+        return *structure_of(scene)[1:3], scene.mechanics.zeros, order, self.fixed_target is None
 
     @property
     def target_range(self) -> Any:
@@ -410,7 +414,7 @@ class Task:
     def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
         """Return a given start as float64 array, or raise a ValueError if the task cannot start there."""
         array = check_state(self.scene, state)
-        for entry, value in zip(self.scene._layout.state, array, strict=True):
+        for entry, value in zip(layout_of(self.scene).state, array, strict=True):
             if entry.kind != "place" and abs(value) > FASTEST_START:
                 raise ValueError(
                     f"{entry.name} must lie within ±{FASTEST_START:g} {entry.unit} at the start, "
@@ -450,7 +454,8 @@ class Task:
         """Return whether the goal holds at states (n, n_state) with targets (n,) or (n, n_targets)."""
         array, count = np.asarray(states), self.formulas.targets
         goals = np.zeros((len(array), count)) if targets is None else np.reshape(targets, (len(array), -1))
-        holds = self.reached(self.formulas._state([*array.T]), self.formulas._targets([*goals.T][:count]), np)
+        after = self.formulas.named_state([*array.T])
+        holds = self.reached(after, self.formulas._targets([*goals.T][:count]), np)
         return np.broadcast_to(np.asarray(holds, np.bool_), len(array))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -587,7 +592,7 @@ class TaskFormulas:
         self._task = task
         self._chances: dict[float, str] = {}
         scene = task.scene
-        self._form = scene._form
+        self._form = form_of(scene)
         #: Whether the step takes the constant ``x``: the largest one of one series, or the series' order.
         self.bounded = self._form is None or bool(self._form.order(task.dt))
         self.state = scene.state_names
@@ -625,22 +630,22 @@ class TaskFormulas:
     def constants(self) -> dict[str, float]:
         """Return every number that compiled functions take, by name."""
         task, scene = self._task, self._task.scene
-        found = dict(scene._constants())
-        found |= {f"self_{name}": float(getattr(scene, name)) for name in scene._numbers()}
+        found = dict(motion_constants_of(scene))
+        found |= {f"self_{name}": float(getattr(scene, name)) for name in parameter_names(scene)}
         for i, name in enumerate(self.state):
             found[f"centre{i}"], found[f"half{i}"] = self.starts[name]
         if task.fixed_target is not None:
             found |= {f"goal{i}": float(value) for i, value in enumerate(task.fixed_target)}
         found |= {name: task.chance(p) for p, name in self._chances.items()}
         found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
-        return found | {"x": scene._limit(task.dt)}
+        return found | {"x": step_argument_of(scene, task.dt)}
 
     def starts_of(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return the nonzero constants of the start for other values of the parameters."""
         k = SimpleNamespace(**self.constants())
         vars(k).update({f"self_{name}": x for name, x in numbers.items()})
         with formula(self._task, "start"):
-            given = dict(self._self(k).start)
+            given = dict(self.with_numbers(k).start)
         found = {}
         for i, name in enumerate(self.state):
             if name in given:
@@ -668,17 +673,18 @@ class TaskFormulas:
 
     def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""
-        scene = self._task.scene
-        return self._form.stepper(self._task.dt, absent) if self._form else scene._stepper.code(absent)
+        if self._form:
+            return self._form.stepper(self._task.dt, absent)
+        return stepper_of(self._task.scene.mechanics).code(absent)
 
     # --- formulas -------------------------------------------------------------------------------------------
 
-    def _self(self, k: Any) -> Task:
+    def with_numbers(self, k: Any) -> Task:
         """Return a copy of the task with recorded numbers."""
         task = copy.copy(self._task)
         for name in ("formulas", "drawn"):
             vars(task).pop(name, None)
-        names = self._task.scene._numbers()
+        names = parameter_names(self._task.scene)
         task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
         task.dt = k.dt
         task._recording = _Recording(
@@ -692,8 +698,9 @@ class TaskFormulas:
             return xp
         return Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
 
-    def _state(self, y: Sequence) -> Values:
-        layout = self._task.scene._layout
+    def named_state(self, y: Sequence) -> Values:
+        """Return the entries of a state by name, and the velocities by coordinate."""
+        layout = layout_of(self._task.scene)
         names = dict(zip(self.state, y, strict=False))
         rates = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
         hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates)}
@@ -707,7 +714,7 @@ class TaskFormulas:
 
     def _call(self, name: str, k: Any, *arguments: Any) -> Any:
         with formula(self._task, name):
-            return getattr(self._self(k), name)(*arguments)
+            return getattr(self.with_numbers(k), name)(*arguments)
 
     def action(self, control: Any) -> Any:
         """Return the unclipped action that requests a control; for tasks with one control."""
@@ -738,7 +745,7 @@ class TaskFormulas:
         if type(self._task).guard is Task.guard:
             return list(wanted.values())
         given = Values("control", wanted)
-        found = self._call("guard", k, given, self._state(y), k.dt, self._known(xp, y))
+        found = self._call("guard", k, given, self.named_state(y), k.dt, self._known(xp, y))
         if isinstance(found, Values):
             return list(found)
         if not isinstance(found, Mapping):
@@ -757,7 +764,7 @@ class TaskFormulas:
 
     def outcome(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
         """Return the reward, and whether the episode is over."""
-        ended = self._call("terminated", k, self._state(z), self._targets(g), self._known(xp, z))
+        ended = self._call("terminated", k, self.named_state(z), self._targets(g), self._known(xp, z))
         return self.reward(xp, y, z, u, g, k), ended
 
     def reward(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
@@ -771,7 +778,7 @@ class TaskFormulas:
     def _reward(self, name: str, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
         xp = self._known(xp, y, z)
         value = self._call(
-            name, k, self._state(y), self._state(z), self._applied(u), self._targets(g), k.dt, xp
+            name, k, self.named_state(y), self.named_state(z), self._applied(u), self._targets(g), k.dt, xp
         )
         if value is None or isinstance(value, Mapping | Sequence):
             raise FormulaError(
@@ -781,7 +788,7 @@ class TaskFormulas:
 
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
         """Return the state after a kick."""
-        added = self._call("kick", k, self._state(z), draws, self._known(xp, z))
+        added = self._call("kick", k, self.named_state(z), draws, self._known(xp, z))
         after = dict(zip(self.state, z, strict=False))
         for name, value in added.items():
             if name not in after:
@@ -798,7 +805,7 @@ class TaskFormulas:
 
     def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the observation."""
-        found = self._call("observe", k, self._state(y), self._targets(g), self._known(xp, y))
+        found = self._call("observe", k, self.named_state(y), self._targets(g), self._known(xp, y))
         if not isinstance(found, Mapping) or not found:
             raise FormulaError(
                 f"{type(self._task).__name__}.observe must return numbers by name, in order, "
@@ -827,7 +834,7 @@ class TaskFormulas:
         if self.draws:
             self.kick(trace, [trace.inputs(f"d{i}")[0] for i in range(self.draws)], z, k)
         self.observe(trace, y, g, k)
-        return tuple(self._call("observe", k, self._state(y), self._targets(g), trace))
+        return tuple(self._call("observe", k, self.named_state(y), self._targets(g), trace))
 
     def sample_targets(self, draws: Sequence, k: Any) -> list:
         """Return targets from draws in [0, 1)."""

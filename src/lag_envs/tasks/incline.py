@@ -433,7 +433,7 @@ crosses a little too early and too fast, which costs more than the time it saves
     def behaviour(self, played: Any) -> Mapping[str, float]:
         """Return when and how fast the line is crossed."""
         last, each = played.steps - 1, np.arange(len(played.steps))
-        before = self.formulas._state(played.states[last, each].T)
+        before = self.formulas.named_state(played.states[last, each].T)
         control = self.limit_control * (0.5 + 0.5 * np.clip(played.actions[last, each, 0], -1.0, 1.0))
         with np.errstate(divide="ignore", invalid="ignore"):  # without a brake, in branches not taken
             time, speed = self.crossing(before, [control], self.dt, np)

@@ -16,6 +16,7 @@ from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import function, indent, next_episode
 from lag_envs.envs.program import SLOW
 from lag_envs.stepping.compiling import BLOCK
+from lag_envs.stepping.lag import lagged_stepper
 from lag_envs.tasks.base import Task
 
 
@@ -48,7 +49,9 @@ class ImperfectProgram(DrawnProgram):
         self._motion: Held | Lagged
         if found.lag:
             lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
-            self._lagged = scene._lagged.code(frozenset(n for n, x in lagged.items() if x == 0.0))
+            self._lagged = lagged_stepper(scene.mechanics).code(
+                frozenset(n for n, x in lagged.items() if x == 0.0)
+            )
             lift = formulas.lift("z")
             self._motion = Lagged(self._lagged, lift, self.n_state, self.y, self.z, self.u, constants)
         else:

@@ -20,8 +20,10 @@ from lag_envs.leaderboard.policies import Controller, Policy
 from lag_envs.leaderboard.site.scenery import picture
 from lag_envs.leaderboard.tracking import Plan
 from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.replay import LEVELS, VERSION
 from lag_envs.scenes import StepRefused
+from lag_envs.scenes.derivation import form_of
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -78,7 +80,7 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
     formulas, rows = task.formulas, env.program.rows
     units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     resting = formulas.rest_action
-    form = task.scene._form
+    form = form_of(task.scene)
     return {
         "id": kind.id,
         "version": VERSION,
@@ -121,7 +123,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     `MARKS`.
     """
     task, program = env.task, env.program
-    names, units = list(program.given), dict(zip(task.scene._numbers(), _units(task), strict=True))
+    names, units = list(program.given), dict(zip(parameter_names(task.scene), _units(task), strict=True))
     fixed = {*program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
     values = {name: getattr(task.scene, name) for name in units if name not in fixed}
     marked = {
@@ -159,7 +161,7 @@ def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
 
 def _units(task: Task) -> list[str]:
     fields = type(task.scene).__dataclass_fields__
-    return [fields[name].metadata["unit"] for name in task.scene._numbers()]
+    return [fields[name].metadata["unit"] for name in parameter_names(task.scene)]
 
 
 def _look(task: Task) -> dict[str, Any]:

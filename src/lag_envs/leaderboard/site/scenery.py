@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Circle, Frame, Magnifier, Ruler, Shape
 from lag_envs.scores import share_of_privileged
@@ -85,7 +86,8 @@ def _open(task: Task) -> dict[str, Any] | None:
 
 def _pairs(scene: Scene) -> list[list[int]]:
     """Return the places of each coordinate and its rate in the state, free coordinates first."""
-    state, free = scene._layout.state, scene._layout.free
+    layout = layout_of(scene)
+    state, free = layout.state, layout.free
     found = [
         [i, j]
         for i, a in enumerate(state)
