@@ -1,8 +1,8 @@
 """Cloning a controller in one file: a network learns the controller's action in every state that it reaches.
 
 It needs no reward, and is at best as good as its expert. In each iteration the network acts, the controller
-labels the states (`Learner.collect`), and the network learns by regression from all data collected so far
-(`Learner.update`). The algorithm is DAgger [1]_.
+labels the states (`CloningLearner.collect`), and the network learns by regression from all data collected
+so far (`CloningLearner.update`). The algorithm is DAgger [1]_.
 
 References
 ----------
@@ -21,8 +21,8 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
-from agents.learners import OwnSettings, trainable
-from agents.ppo import Policy, network, shared_weights
+from agents.learners import LearnerSettings, trainable
+from agents.ppo import ActingPolicy, network, shared_weights
 from agents.run import FIRST_FRESH_SEED, UserError
 from lag_envs.controllers import build
 from lag_envs.envs.stagger import stagger
@@ -32,7 +32,7 @@ NAME = "cloning"  #: see `agents.learners.OWN`
 Array = NDArray[np.float32]
 
 
-class Settings(OwnSettings):
+class CloningSettings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -48,7 +48,7 @@ class Settings(OwnSettings):
     first_layer_scale: float = Field(gt=0, description="factor of the first layer's weights at the start")
 
 
-class Learner:
+class CloningLearner:
     """Environments, controller, network and optimiser.
 
     Parameters
@@ -68,7 +68,7 @@ class Learner:
         For an environment whose actions are choices, and for one without such a controller.
     """
 
-    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
+    def __init__(self, env_id: str, settings: CloningSettings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the network is too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
@@ -88,7 +88,7 @@ class Learner:
         self.seen, self.wanted = np.empty((0, wide), np.float32), np.empty((0, formulas.actions), np.float32)
         self.actor = network([wide, *settings.actor, formulas.actions], settings.first_layer_scale)
         self.adam = torch.optim.Adam(self.actor.parameters(), fused=True)
-        self.policy = Policy(shared_weights(self.actor), (), formulas.largest)
+        self.policy = ActingPolicy(shared_weights(self.actor), (), formulas.largest)
 
     def iterate(self) -> None:
         """Collect the controller's actions, and learn them."""

@@ -121,7 +121,7 @@ def suits(algo: str, task: Task) -> bool:
     return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
 
 
-class OwnSettings(Strict):
+class LearnerSettings(Strict):
     """Settings of a learner of our own.
 
     Attributes
@@ -323,7 +323,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
             run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-            mean = play(run.env, Policy(self.model, bins=numbered(run.hyperparameters)), seeds).mean()
+            mean = play(run.env, LearnedPolicy(self.model, bins=numbered(run.hyperparameters)), seeds).mean()
             run.trained = self.last = self.num_timesteps
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
             if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
@@ -384,7 +384,7 @@ def finish(run: Run, best: Mapping[str, Any]) -> None:
     if normalise is not None and normalise.norm_obs:
         write(run.path(NORMALISATION), best["normalisation"])
     model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu")
-    evaluate(run, Policy(model, normalise, numbered(run.hyperparameters)), best["trained"])
+    evaluate(run, LearnedPolicy(model, normalise, numbered(run.hyperparameters)), best["trained"])
 
 
 def evaluate(run: Run, policy: Any, kept: int) -> None:
@@ -415,7 +415,7 @@ def evaluate(run: Run, policy: Any, kept: int) -> None:
 # --- policies -----------------------------------------------------------------------------------------------
 
 
-class Policy:
+class LearnedPolicy:
     """A learner's policy as it acts in the environments themselves: observations in, actions in [-1, 1] out.
 
     Parameters
@@ -473,4 +473,4 @@ def load_policy(folder: Path) -> Any:
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"the policy in {folder} cannot be read ({reason}); train it again") from error
-    return Policy(model, normalise, numbered(result["hyperparameters"]))
+    return LearnedPolicy(model, normalise, numbered(result["hyperparameters"]))

@@ -22,13 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds
 from agents.value_iteration import (
     CacheError,
+    DynamicProgramme,
     Grid,
     Kick,
     carried,
     interpolate_rows,
     stretched,
 )
-from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
 from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.envs.model import Model
@@ -172,7 +172,7 @@ class Solution:
             self.programs.append(program)
             self.seconds += program.seconds
 
-    def program(self, target: float | None) -> Programme:
+    def program(self, target: float | None) -> DynamicProgramme:
         """Return the dynamic programme for a target."""
         problem = self.problem
         # The fingerprint does not cover the step between the points where it is evaluated.
@@ -183,7 +183,7 @@ class Solution:
         actions = np.linspace(-1.0, 1.0, problem.actions)
         step = functools.partial(self.step, target=target)
         places = grid(problem, self.level, target)
-        return Programme(places, actions, step, self.steps, self.kick, parameters)
+        return DynamicProgramme(places, actions, step, self.steps, self.kick, parameters)
 
     def states(self, points: Array) -> Array:
         """Return the scene's states for points on the grid."""
@@ -268,7 +268,7 @@ class Solution:
         return sum(w * self.value(times, p, targets) for w, p in zip(weights, outcomes, strict=True))
 
 
-class Optimal(LookAhead):
+class GreedyPolicy(LookAhead):
     """The greedy policy of a computed value function.
 
     Parameters
@@ -393,7 +393,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
     relaxed = env_id != source or bool(problem.options)
     lower, started = None, time.process_time()
     if not relaxed:
-        agent = Optimal(env_id, solution=solution)
+        agent = GreedyPolicy(env_id, solution=solution)
         found = statistics.estimate([play(env_id, agent, fresh_seeds(EPISODES))])
         low, high = (round(found[end], 4) for end in ("low", "high"))
         lower = {"mean": round(found["mean"], 4), "interval": [low, high]}
@@ -499,7 +499,7 @@ def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
                 plot.set_title(f"{name} = {axes[2][i]:.3g} {unit.strip('[]')}", fontsize=9)
         plots[0].set_ylabel(problem.axes[1].label)
         if not problem.options and len(axes) == 2:
-            played = record(Rollout(env_id, Optimal(env_id, solution=solution), fresh_seeds(1)))
+            played = record(Rollout(env_id, GreedyPolicy(env_id, solution=solution), fresh_seeds(1)))
             states = played.states[:, 0, solution.keep]
             if problem.axes[0].periodic:
                 states[:, 0] = np.mod(states[:, 0], problem.axes[0].high)

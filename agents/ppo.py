@@ -1,8 +1,8 @@
 """Proximal policy optimisation in one file of plain PyTorch: read it from top to bottom.
 
 ``python -m agents.ppo --help`` has the options. An iteration lets the policy act in all environments
-(`Learner.collect`), estimates how much better each action was than expected (`Learner.advantages`), and
-makes better actions more likely, within limits (`Learner.update`). The algorithm is that of [1]_, with the
+(`PPOLearner.collect`), estimates how much better each action was than expected (`PPOLearner.advantages`), and
+makes better actions more likely, within limits (`PPOLearner.update`). The algorithm is that of [1]_, with the
 estimator of [2]_ and the exploration of [3]_.
 
 References
@@ -33,7 +33,7 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
-from agents.learners import OwnSettings, trainable
+from agents.learners import LearnerSettings, trainable
 from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
 from agents.train import command, follow, here, plan, summarise
 from lag_envs.envs.stagger import stagger
@@ -47,7 +47,7 @@ Array = NDArray[np.float32]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-class Settings(OwnSettings):
+class PPOSettings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -99,7 +99,7 @@ def shared_weights(layers: nn.Sequential) -> list[tuple[Array, Array]]:
     return [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
 
 
-class Policy:
+class ActingPolicy:
     """The acting policy: a network's weights as NumPy arrays, faster than PyTorch for small batches.
 
     Parameters
@@ -159,7 +159,7 @@ class Policy:
         write(path, file.getvalue())
 
     @classmethod
-    def load(cls, path: Path) -> Policy:
+    def load(cls, path: Path) -> ActingPolicy:
         """Return the policy that `save` wrote."""
         with np.load(path, allow_pickle=False) as found:
             count = sum(name.startswith("weight_") for name in found)
@@ -167,7 +167,7 @@ class Policy:
             return cls(layers, tuple(found["choices"].tolist()), float(found["largest"]))
 
 
-class Continuous:
+class GaussianActor:
     """Continuous actions: Gaussian around the actor's outputs, with noise held for some steps.
 
     The noise is features · E, where E (features, actions) is drawn with a learned standard deviation of each
@@ -175,7 +175,7 @@ class Continuous:
     state. The environment clips actions beyond the action space.
     """
 
-    def __init__(self, settings: Settings, actions: int) -> None:
+    def __init__(self, settings: PPOSettings, actions: int) -> None:
         self.by_state, self.steps = settings.state_noise, settings.noise_steps
         shape = settings.actor[-1] if self.by_state else 1, actions
         self.log_std = nn.Parameter(torch.full(shape, float(settings.log_std_init)))
@@ -198,10 +198,10 @@ class Continuous:
         return -0.5 * ((actions - means).square() / variance + log).sum(1), 0.5 * log.sum(1)
 
 
-class Choices:
+class CategoricalActor:
     """Discrete actions: the actor outputs a logit for each value of each list."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: ActingPolicy) -> None:
         self.policy = policy
         self.parameters: list[nn.Parameter] = []
 
@@ -220,7 +220,7 @@ class Choices:
 # --- learning -----------------------------------------------------------------------------------------------
 
 
-class Rollout(NamedTuple):
+class Experience(NamedTuple):
     """The experience of n environments in T steps."""
 
     observations: Array  #: (T + 1, n, n_observation)
@@ -231,7 +231,7 @@ class Rollout(NamedTuple):
     final: Array  #: (T, n, n_observation); last observations of episodes, at the steps at which they end
 
 
-class Learner:
+class PPOLearner:
     """Environments, networks and optimiser.
 
     Parameters
@@ -246,7 +246,7 @@ class Learner:
         Steps to train for; with them the learning rate is 0.
     """
 
-    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
+    def __init__(self, env_id: str, settings: PPOSettings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
@@ -265,8 +265,10 @@ class Learner:
         inputs, outputs = self.observation.shape[1], sum(formulas.choices) or formulas.actions
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
-        self.policy = Policy([], formulas.choices, formulas.largest)
-        self.head = Choices(self.policy) if formulas.choices else Continuous(settings, formulas.actions)
+        self.policy = ActingPolicy([], formulas.choices, formulas.largest)
+        self.head = (
+            CategoricalActor(self.policy) if formulas.choices else GaussianActor(settings, formulas.actions)
+        )
         # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
         parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
         self.parameters = nn.Parameter(torch.cat([p.detach().flatten() for p in parts]))
@@ -284,12 +286,12 @@ class Learner:
         self.update(rollout, *self.advantages(rollout))
         self.trained += rollout.rewards.size
 
-    def collect(self) -> Rollout:
+    def collect(self) -> Experience:
         """Let the policy act."""
         steps, n = self.settings.n_steps, self.settings.n_envs
         wide = self.observation.shape[1]
         kind = np.int64 if self.policy.choices else np.float32
-        found = Rollout(
+        found = Experience(
             np.empty((steps + 1, n, wide), np.float32), np.empty((steps, n, self.actions), kind),
             np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_), np.empty((steps, n), np.bool_),
             np.zeros((steps, n, wide), np.float32),
@@ -308,7 +310,7 @@ class Learner:
         return found
 
     @torch.no_grad()
-    def advantages(self, found: Rollout) -> tuple[Array, Array]:
+    def advantages(self, found: Experience) -> tuple[Array, Array]:
         """Return the advantages of the actions and the critic's targets, (T, n) each.
 
         A truncated episode would have continued: the value of its last observation stands for the rest.
@@ -325,7 +327,7 @@ class Learner:
             later = advantages[t] = surprise[t] + decay * ~found.over[t] * later
         return advantages, advantages + values[:-1]
 
-    def update(self, found: Rollout, advantages: Array, targets: Array) -> None:
+    def update(self, found: Experience, advantages: Array, targets: Array) -> None:
         """Improve actor and critic by some epochs of Adam on the collected experience."""
         s, body, last = self.settings, self.actor[:-1], self.actor[-1]
         self.adam.param_groups[0]["lr"] = s.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
@@ -387,7 +389,7 @@ examples:
 """
 
 #: Settings that are command-line options; n_timesteps is --steps.
-OPTIONS = [name for name in Settings.model_fields if name != "n_timesteps"]
+OPTIONS = [name for name in PPOSettings.model_fields if name != "n_timesteps"]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -406,7 +408,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
     group = p.add_argument_group("settings, of which each task has its own")
     for name in OPTIONS:
-        field = Settings.model_fields[name]
+        field = PPOSettings.model_fields[name]
         kind: Any = {float: float, bool: truth}.get(field.annotation, int)
         many: Any = {"nargs": "+"} if field.annotation == list[PositiveInt] else {}
         group.add_argument(
@@ -430,7 +432,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     changed = {name: value for name, value in given.items() if value is not None}
     runs = plan(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
-        Settings.of(run.hyperparameters)  # fail now, not after another seed has been trained
+        PPOSettings.of(run.hyperparameters)  # fail now, not after another seed has been trained
     todo = [run for run in runs if run.load_result() is None]
     failed, stopped = follow(todo, here) if todo else ({}, False)
     summarise([run for run in runs if run.name not in failed])

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
-from agents.measure import Evaluation, Job, measure
+from agents.measure import Evaluation, MeasurementJob, measure
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int, changed: int | None
-) -> list[tuple[Evaluation, list[Job]]]:
+) -> list[tuple[Evaluation, list[MeasurementJob]]]:
     """Make the missing measurements; return the environments with everything to measure."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
@@ -131,7 +131,7 @@ def measure_all(
 # --- the summary --------------------------------------------------------------------------------------------
 
 
-def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old: Data) -> Data:
+def summarise(found: Sequence[tuple[Evaluation, list[MeasurementJob]]], episodes: int, old: Data) -> Data:
     """Return everything that page and figures need; agents not measured now keep their old numbers."""
     envs = dict(old.get("envs", {}))
     for evaluation, jobs in found:
@@ -152,7 +152,7 @@ def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old:
     }
 
 
-def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[Job], before: Data | None) -> Data:
+def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[MeasurementJob], before: Data | None) -> Data:
     """Return the summary of an environment, with other agents' numbers from an earlier one."""
     env_id = evaluation.env
     found = rounded(summarise_env(evaluation.measured(jobs), known_returns(env_id)))

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from agents.learners import label
 from agents.measure import Entrant, learned
-from agents.optimum import Optimal, played
+from agents.optimum import GreedyPolicy, played
 from agents.results import ROOT, to_json
 from agents.run import RESULT, UserError, check_env, read_result, reports_errors
 from lag_envs import TASKS
@@ -161,7 +161,7 @@ def measured(
             returns = many(env_id, agent, batches, size)
             show(name, *mean_and_error(returns), len(returns), in_use.get(name))
         elif not quick:
-            agent = Optimal(env_id) if name == "optimal" else build(task, name)
+            agent = GreedyPolicy(env_id) if name == "optimal" else build(task, name)
             returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
             same = None
             if task.reference:

@@ -18,7 +18,7 @@ from lag_envs.benchmark import cold_start, contestants, divisions, docs, energie
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import stagger_episodes
-from lag_envs.benchmark.measurement import Settings, bench
+from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.benchmark.peak import PRODUCTS
 from lag_envs.benchmark.results import quartiles, ratios, summary
 from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure
@@ -146,7 +146,9 @@ def test_a_reader_that_leaves_is_no_error(tmp_path):
 def tiny(tmp_path, **changes):
     """Return settings for a measurement of minimal length."""
     some = {"ids": (ID,), "sizes": (1, 3), "rounds": 2, "seconds": 1e-4, "cold_starts": 0}
-    return Settings(**(some | {"date": "2020-02-20", "output": str(tmp_path / "speed.json")} | changes))
+    return BenchmarkSettings(
+        **(some | {"date": "2020-02-20", "output": str(tmp_path / "speed.json")} | changes)
+    )
 
 
 def broken(n):

@@ -20,7 +20,7 @@ from lag_envs import scores
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import protocol, ranking, standings, submission
 from lag_envs.leaderboard.board import Board, BoardError, closed, id_of
-from lag_envs.leaderboard.log import Line, fold, parse
+from lag_envs.leaderboard.log import LogLine, fold, parse
 from lag_envs.leaderboard.parallel import map_submissions, packed
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
@@ -350,7 +350,7 @@ def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
     told = next(line for line in parse(board.log.read_bytes())[0] if line.event.event == "opened")
     again = [
         *parse(board.log.read_bytes())[0],
-        Line(99, told.event.model_copy(update={"at": board.read().last})),
+        LogLine(99, told.event.model_copy(update={"at": board.read().last})),
     ]
     with pytest.raises(BoardError, match=f"{new} joins protocol 1, and has a board there already"):
         fold(again)

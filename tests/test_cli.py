@@ -198,7 +198,7 @@ def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
     with pytest.raises(UserError, match=rf"observes \(5,\) numbers, {FREE} has \(3,\)"):
         watch.load(FREE, TASKS[FREE](), str(tmp_path / "model.zip"))
     bins = SimpleNamespace(action_space=gym.spaces.Discrete(5), predict=lambda *_, **__: (np.array(4), None))
-    assert watch.Model(bins, None, gym.make(ID).action_space).predict(observation)[0] == np.float32(0.8)
+    assert watch.SB3Model(bins, None, gym.make(ID).action_space).predict(observation)[0] == np.float32(0.8)
 
 
 def test_watch_opens_a_window_until_it_is_closed(window, capsys, monkeypatch):

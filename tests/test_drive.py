@@ -19,7 +19,7 @@ from test_policies import OWN as LATER_TASKS
 from lag_envs import cli, replay
 from lag_envs.controllers import controllers
 from lag_envs.envs.unfused import Unfused
-from lag_envs.leaderboard.policies import Policy, architecture
+from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
 from lag_envs.leaderboard.site.build import build
 from lag_envs.leaderboard.site.driving import agent, script_of, sliders
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum, pivoted_bar
@@ -519,7 +519,9 @@ POLICIES = [*policies(), *((f"{id}: {table}", id, table, None) for id, table in 
 
 def made(id, table, arrays):
     arrays = numbers(id, table) if arrays is None else arrays
-    return Policy(architecture(id, table), {name: np.asarray(x, np.float64) for name, x in arrays.items()})
+    return SubmittedPolicy(
+        architecture(id, table), {name: np.asarray(x, np.float64) for name, x in arrays.items()}
+    )
 
 
 def covering_architectures():
@@ -567,7 +569,7 @@ def test_agents_act_in_the_page_as_in_python(browsing, bare, monkeypatch, name, 
 @pytest.mark.parametrize("name", ["random", "energy shaping + LQR", "iLQR"])
 def test_others_run_in_python_only(name):
     table = {"architecture": "controller", "name": name}
-    assert agent(Policy(architecture("PivotedBar-v0", table), {})) is None
+    assert agent(SubmittedPolicy(architecture("PivotedBar-v0", table), {})) is None
 
 
 @pytest.fixture(scope="module")
@@ -614,7 +616,7 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
     ghost = id == cylinder_in_cylinder.Tilt.id
     if ghost:
         axes = {"axis_0": np.linspace(-1, 1, 9), "axis_1": np.linspace(-2, 2, 9), "table": np.ones((9, 9))}
-        data["environments"][0]["rows"][0]["agent"] = agent(Policy(architecture(id, table), axes))
+        data["environments"][0]["rows"][0]["agent"] = agent(SubmittedPolicy(architecture(id, table), axes))
     build(data, tmp_path)
     assert any(np.quantile(frames(drive(id, folder=tmp_path), ghost), 0.95) <= 8.0 for _ in range(3))
 

@@ -185,10 +185,10 @@ def test_energy_changes_by_what_power_says(case):
 
 def rate(scene, states, controls):
     """Return d(state)/dt by solving for accelerations; that of w by differences along the motion."""
-    from lag_envs.mechanics.evaluation import Numeric, Point
+    from lag_envs.mechanics.evaluation import MotionPoint, Numeric
 
     columns = [np.moveaxis(a, -1, 0) for a in (states, controls)]
-    point = Point(scene.mechanics, scene._symbols(), *columns, Numeric)
+    point = MotionPoint(scene.mechanics, scene._symbols(), *columns, Numeric)
     return np.stack([np.broadcast_to(r, states.shape[:-1]) for r in point.rates()], axis=-1)
 
 

@@ -31,7 +31,7 @@ from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.driver import compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
-from lag_envs.stepping.machine import Layout
+from lag_envs.stepping.machine import LaneLayout
 from lag_envs.stepping.series import REACH, Certificate, Plain, Series
 from lag_envs.stepping.tracing import evaluate
 
@@ -364,7 +364,7 @@ def test_unfused_bits_are_those_of_plain_numbers(monkeypatch):
 def test_lanes_of_a_block_have_the_bits_of_a_single_one():
     case, generator, dt, order = CASES["cart"], np.random.default_rng(3), 0.02, 16
     code, numbers = code_of(case.scene)
-    layout, n = Layout(code.record), code.record.size
+    layout, n = LaneLayout(code.record), code.record.size
     stepper = LaggedStepper(case.scene.mechanics)
     constants = motion_constants_of(case.scene, lagged=True)
     advance, xp = code.compile(), types.SimpleNamespace(where=lambda c, a, b: a if c else b)

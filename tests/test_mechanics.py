@@ -12,7 +12,7 @@ from lag_envs.mechanics.algebra import (
     LARGEST_PRODUCT,
     Atom,
     Expr,
-    Functions,
+    RecordedFunctions,
     collect,
     derivative,
     evaluate,
@@ -64,7 +64,7 @@ def formula(seed, leaves, xp):
 @pytest.mark.parametrize("seed", range(40))
 def test_formulas_have_the_value_and_the_derivatives_that_numbers_give(seed):
     known = values()
-    expr = Expr.of(formula(seed, [Expr.of(place) for place in PLACES], Functions()))
+    expr = Expr.of(formula(seed, [Expr.of(place) for place in PLACES], RecordedFunctions()))
     number = formula(seed, list(known.values()), mpmath)
     assert all(agree(x, number) for x in evaluate([expr, collect(expr)], known, mpmath))
     for i, place in enumerate(PLACES):

@@ -13,7 +13,7 @@ from lag_envs.report import formulas, reference
 from lag_envs.report import oracle as oracles
 from lag_envs.report.bound import driven
 from lag_envs.report.closed_forms import elliptic, linear
-from lag_envs.report.formulas import Formulas
+from lag_envs.report.formulas import OperationList
 from lag_envs.report.oracle import Oracle, Unresolved, oracle_of
 from lag_envs.scenes import Scene, parameter
 from lag_envs.stepping.pendulum import Coefficients
@@ -380,7 +380,7 @@ def test_a_motion_to_the_edge_of_one_is_resolved():
 def test_a_power_that_it_does_not_know_is_named():
     x = sympy.Symbol("x")
     with pytest.raises(ValueError, match=r"the power x\*\*\(1/3\) is neither whole nor a half"):
-        Formulas([x ** sympy.Rational(1, 3)], [x], [])
+        OperationList([x ** sympy.Rational(1, 3)], [x], [])
 
 
 def test_a_state_of_another_length_is_refused():
@@ -405,8 +405,8 @@ def test_it_shares_no_code_with_what_it_checks():
         for name in node.names
     ]
     assert {name for name in imports if name.startswith("lag_envs")} == {
-        "lag_envs.scenes.symbolic", "lag_envs.report.formulas.Formulas", "lag_envs.report.formulas.Series",
-        "lag_envs.scenes.base.Scene",
+        "lag_envs.scenes.symbolic", "lag_envs.report.formulas.OperationList",
+        "lag_envs.report.formulas.FormulaSeries", "lag_envs.scenes.base.Scene",
     }  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import pytest
 from lag_envs import own_files
 from lag_envs.benchmark import cold_start, contestants
 from lag_envs.benchmark.actions import actions_of
-from lag_envs.benchmark.measurement import Settings, bench
+from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.cli import main
 from lag_envs.errors import UserError
 
@@ -230,7 +230,7 @@ def test_bench_takes_tasks_of_a_file(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(contestants, "PEERS", [])
     ids = tuple(own_files.registered(SEVERAL))
     assert ids == ("OwnCrane-v0", "OwnSwitched-v0", "OwnDrift-v0")
-    settings = Settings(ids[-1:], (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
+    settings = BenchmarkSettings(ids[-1:], (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
     rows = [row for row in bench(settings)["rows"] if row["library"] == "lag_envs"]
     assert len(rows) == 3 and all(row["rates"] for row in rows), [row["problem"] for row in rows]
 

@@ -16,7 +16,7 @@ from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.alike import Likeness, check_twins
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.kernels import affine
-from lag_envs.leaderboard.policies import ARCHITECTURES, Policy, architecture
+from lag_envs.leaderboard.policies import ARCHITECTURES, SubmittedPolicy, architecture
 from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.leaderboard.verify import replay, verify
 from lag_envs.scenes import TwoLinkArm
@@ -91,7 +91,7 @@ def numbers(env, policy, seed=0):
 
 
 def agent(env, policy, seed=0):
-    return Policy(architecture(env, policy), numbers(env, policy, seed)).agent()
+    return SubmittedPolicy(architecture(env, policy), numbers(env, policy, seed)).agent()
 
 
 def submission(folder, env, policy, **changed):
@@ -195,7 +195,7 @@ def test_a_plan_is_followed_and_held():
     }
     names = TwoLinkArm().state_names
     assert names == ("theta_1", "theta_1_dot", "theta_2", "theta_2_dot")
-    acting = Policy(made, arrays).agent()
+    acting = SubmittedPolicy(made, arrays).agent()
     observation = np.array([math.cos(0.3), math.sin(0.3), 1.0, 0.0, 0.0, 0.15])
     told, memory = [], None
     for _ in range(4):

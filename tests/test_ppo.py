@@ -168,7 +168,7 @@ def test_it_learns_with_any_actions(env_id, space, own, tmp_path):
     assert gym.make_vec(env_id, 2).single_action_space == space
     settings = {"n_envs": 16, "n_steps": 32, "batch_size": 128, "n_epochs": 5, "episode_share": 1.0}
     run = make_run(tmp_path, env_id, steps=6_000, **settings)
-    learner = ppo.Learner(env_id, ppo.Settings.of(run.hyperparameters), 0, run.steps)
+    learner = ppo.PPOLearner(env_id, ppo.PPOSettings.of(run.hyperparameters), 0, run.steps)
     before = play(env_id, learner.policy, fresh_seeds(100)).mean()
     while learner.trained < run.steps:
         learner.iterate()
@@ -194,8 +194,8 @@ def test_it_swings_the_bar_up(tmp_path, monkeypatch):
 
 
 def make_learner(env_id=ENV, **more):
-    settings = ppo.Settings.of(hyperparameters(ppo.NAME, env_id) | SHORT | more)
-    return ppo.Learner(env_id, settings, 0, 10_000)
+    settings = ppo.PPOSettings.of(hyperparameters(ppo.NAME, env_id) | SHORT | more)
+    return ppo.PPOLearner(env_id, settings, 0, 10_000)
 
 
 def test_advantages_are_sums_of_later_surprises():
@@ -206,7 +206,9 @@ def test_advantages_are_sums_of_later_surprises():
     over, terminated = np.zeros(shape, bool), np.zeros(shape, bool)
     over[2, 0] = over[3, 1] = terminated[3, 1] = True
     draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
-    found = ppo.Rollout(draw(7, 2, wide), draw(*shape, 1), draw(*shape), terminated, over, draw(*shape, wide))
+    found = ppo.Experience(
+        draw(7, 2, wide), draw(*shape, 1), draw(*shape), terminated, over, draw(*shape, wide)
+    )
     advantages, targets = learner.advantages(found)
 
     def value(observation):
@@ -324,18 +326,18 @@ def test_settings_of_another_kind_are_refused():
         ({"gamma": "x"}, "gamma: Input should be a valid number, got 'x'"),
     ):
         with pytest.raises(UserError, match=message):
-            ppo.Settings.of(good | changes)
+            ppo.PPOSettings.of(good | changes)
     del good["gamma"]
     with pytest.raises(UserError, match="settings of fast_ppo: gamma is missing"):
-        ppo.Settings.of(good)
+        ppo.PPOSettings.of(good)
 
 
 def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
-    settings = ppo.Settings.of(hyperparameters(ppo.NAME, ENV) | SHORT)
+    settings = ppo.PPOSettings.of(hyperparameters(ppo.NAME, ENV) | SHORT)
     lag_envs.register(pivoted_bar.SwingUpFree, id="OwnEndless-v0", duration=float("inf"))
     try:
         with pytest.raises(UserError, match="have no end; give it a duration"):
-            ppo.Learner("OwnEndless-v0", settings, 0, 100)
+            ppo.PPOLearner("OwnEndless-v0", settings, 0, 100)
     finally:
         gym.registry.pop("OwnEndless-v0")
 
@@ -362,10 +364,10 @@ def test_networks_of_any_actions_act_as_on_the_leaderboard(task, tmp_path):
     outputs, file = sum(formulas.choices) or formulas.actions, tmp_path / MODEL
     draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
     layers = [(draw(8, wide), draw(8)), (draw(outputs, 8), draw(outputs))]
-    ppo.Policy(layers, formulas.choices, formulas.largest).save(file)
+    ppo.ActingPolicy(layers, formulas.choices, formulas.largest).save(file)
     table, arrays = arrays_of(file)
     theirs, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
-    policy = ppo.Policy.load(file)
+    policy = ppo.ActingPolicy.load(file)
     ours = policy.predict(seen)[0]
     np.testing.assert_array_equal(ours, theirs.predict(seen)[0])
     assert np.ptp(ours) >= formulas.largest
@@ -405,7 +407,7 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
 
 def test_every_setting_that_may_be_drawn_is_one():
     for number in range(200):
-        ppo.Settings.of(hyperparameters(ppo.NAME, ENV) | tune.drawn(number))
+        ppo.PPOSettings.of(hyperparameters(ppo.NAME, ENV) | tune.drawn(number))
     assert tune.drawn(1) == tune.drawn(1) != tune.drawn(2)
 
 

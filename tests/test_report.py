@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from lag_envs.cli import main
 from lag_envs.report import docs, page
-from lag_envs.report.report import SECTIONS, NotAReport, Settings, content_of, make_report, prepare
+from lag_envs.report.report import SECTIONS, NotAReport, ReportSettings, content_of, make_report, prepare
 from lag_envs.report.runner import load, module, run_jobs
 from tests import dummy_section
 from tests.dummy_section import job
@@ -25,7 +25,7 @@ PROJECT = Path(__file__).parents[1]
 
 
 def settings(folder, **changes):
-    return Settings(str(folder), sections=(dummy_section.SECTION,), processes=1, **changes)
+    return ReportSettings(str(folder), sections=(dummy_section.SECTION,), processes=1, **changes)
 
 
 # --- jobs ---
@@ -215,7 +215,7 @@ def test_compact_form(written, tmp_path, monkeypatch):
     (tmp_path / "README.md").write_text(marks["fast"])
     (tmp_path / "docs" / "speed.md").write_text(marks["fast"] + marks["bench"])
     monkeypatch.setattr(
-        docs, "PARTS", (docs.Part(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
+        docs, "PARTS", (docs.PagePart(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
     )
     monkeypatch.setattr(docs.overview, "draw", lambda _: Figure())
     monkeypatch.setattr(docs.overview, "findings", lambda _: ["Nobody is faster."])

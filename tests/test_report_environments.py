@@ -13,10 +13,10 @@ from rollouts import actions
 
 from lag_envs.report import environment_results, environments, episodes, gymnasium_peers
 from lag_envs.report.bound import Driven
-from lag_envs.report.episodes import Episode, play, random_actions, replay
+from lag_envs.report.episodes import RecordedEpisode, play, random_actions, replay
 from lag_envs.report.integrators import comparison
 from lag_envs.report.oracle import Oracle, oracle_of
-from lag_envs.report.runner import Result
+from lag_envs.report.runner import JobResult
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
@@ -197,7 +197,9 @@ def test_one_step_of_peers_is_the_worst_of_all_steps():
     """Explicit Euler's error of a step is h²/2 of the second derivative: larger once the pole falls."""
     env, peer, episode = short_episode("CartPole-v1")
     row = gymnasium_peers.measure(env, peer, episode)
-    first = gymnasium_peers.measure(env, peer, Episode(episode.states[:2], episode.controls[:1], False))
+    first = gymnasium_peers.measure(
+        env, peer, RecordedEpisode(episode.states[:2], episode.controls[:1], False)
+    )
     assert row["error"]["one step"] > first["error"]["one step"] > 1e-6
 
 
@@ -224,7 +226,9 @@ def rows():
 
 
 def test_small_report(rows):
-    content = environments.content(rows, [Result("environments", "Acrobot-v1, seed 0", "", problem="lost")])
+    content = environments.content(
+        rows, [JobResult("environments", "Acrobot-v1, seed 0", "", problem="lost")]
+    )
     assert [claim.holds for claim in content.claims] == [True] * len(content.claims)
     for table in (*content.tables, *content.details, content.summary):
         assert table.rows and all(len(line) == len(table.columns) for line in table.rows)

@@ -9,12 +9,12 @@ from covering import slow
 
 from lag_envs.report import general, general_results
 from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
-from lag_envs.report.motions import Certified, SceneEquation, SceneProblems
+from lag_envs.report.motions import CertifiedSeries, SceneEquation, SceneProblems
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import ends
-from lag_envs.report.rivals import Compiled
+from lag_envs.report.rivals import CompiledMethod
 from lag_envs.scenes import Scene, parameter
 from lag_envs.scenes.derivation import order_of
 
@@ -71,8 +71,8 @@ def test_what_moves_a_support(control):
     truth = ends(scene, states, controls, 0.05)
     problems = SceneProblems(scene, states, controls)
     for rival in (
-        Certified(Certified.method_of(18), 1e-14),
-        Compiled("DOP853", 8),
+        CertifiedSeries(CertifiedSeries.method_of(18), 1e-14),
+        CompiledMethod("DOP853", 8),
         CompiledRadau("Radau IIA", 200),
     ):
         assert general.errors(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
@@ -119,7 +119,9 @@ def test_ours_is_what_simulate_does(name, together):
     problems, _ = problem(name)
     order = int(order_of(problems.scene, general_results.DT))
     found = (
-        Certified(Certified.method_of(order), 1e-14).build(problems, general_results.DT, 1, together).end()
+        CertifiedSeries(CertifiedSeries.method_of(order), 1e-14)
+        .build(problems, general_results.DT, 1, together)
+        .end()
     )
     paths = [
         problems.scene.simulate(y, u[None], general_results.DT)[-1]
@@ -131,8 +133,8 @@ def test_ours_is_what_simulate_does(name, together):
 @pytest.mark.parametrize("name", ["cart-pole", slow("rotary pendulum")])
 def test_every_rival_converges(name):
     """No form is fast because it is broken."""
-    assert worst(Certified(Certified.method_of(12), 1e-6), name) < 1e-5
-    for rival in (Compiled("RK4", 256), Compiled("DOP853", 8), CompiledRadau("Radau IIA", 64)):
+    assert worst(CertifiedSeries(CertifiedSeries.method_of(12), 1e-6), name) < 1e-5
+    for rival in (CompiledMethod("RK4", 256), CompiledMethod("DOP853", 8), CompiledRadau("Radau IIA", 64)):
         assert worst(rival, name) < 1e-9, rival.method
     for family, setting, goal in (("mujoco", 128, 1e-9),):
         if importlib.util.find_spec(family):
@@ -184,7 +186,7 @@ def test_a_defeat_is_told_like_a_win():
 def test_what_is_missing_is_said_and_no_error(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "heyoka", None)
     problems, truth = problem("cart-pole")
-    clock = Certified(Certified.method_of(16), 1e-12)
+    clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
     rows = list(
         general.measured(
             problems, truth, [Heyoka("Taylor", 1e-9)], clock, "single", 1, {"system": "cart-pole"}

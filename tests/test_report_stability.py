@@ -9,13 +9,13 @@ from mpmath import mp, mpf
 from lag_envs.report import bound, extremes, reference, stability, stability_maps, stability_results
 from lag_envs.report.cases import Case, ensemble, scales
 from lag_envs.report.oracle import Unresolved
-from lag_envs.report.runner import Result
+from lag_envs.report.runner import JobResult
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.tasks import cylinder_in_cylinder
 
-PROBLEM = Result("bound", "lost", "key", problem="stopped after 1 s")
+PROBLEM = JobResult("bound", "lost", "key", problem="stopped after 1 s")
 
 
 def draw(content):

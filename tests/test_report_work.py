@@ -15,12 +15,12 @@ from lag_envs.report import diagrams, peers, verdicts, work_precision
 from lag_envs.report.cases import VARIANTS, ensemble
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
-from lag_envs.report.points import MODES, Point
-from lag_envs.report.rivals import Compiled, Ours
-from lag_envs.report.runner import Result
-from lag_envs.report.timing import Kernels
+from lag_envs.report.points import MODES, WorkPrecisionPoint
+from lag_envs.report.rivals import CompiledMethod, ShippedStepping
+from lag_envs.report.runner import JobResult
+from lag_envs.report.timing import FlowSteps
 from lag_envs.report.verdicts import OURS, TARGETS
-from lag_envs.report.work_precision import Series
+from lag_envs.report.work_precision import OrderedMethod
 from lag_envs.scenes.derivation import form_of
 
 BAR = VARIANTS["PivotedBar"].scene()
@@ -64,7 +64,7 @@ def test_order_of_convergence(method):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_is_exact(name, mode):
     """A regression of the shipped stepper's accuracy fails here."""
-    assert worst(Ours(Ours.METHOD, 1), name, mode == "batch", count=12) < 1e-15
+    assert worst(ShippedStepping(ShippedStepping.METHOD, 1), name, mode == "batch", count=12) < 1e-15
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -74,11 +74,15 @@ def test_ours_is_what_simulate_does(name):
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
-    found = ((Ours.METHOD, 1, dt, 3), (Ours.METHOD, 2, dt / 2, 6), (Ours.ONE_CALL, 1, steps * dt, 1))
+    found = (
+        (ShippedStepping.METHOD, 1, dt, 3),
+        (ShippedStepping.METHOD, 2, dt / 2, 6),
+        (ShippedStepping.ONE_CALL, 1, steps * dt, 1),
+    )
     for method, n, length, count in found:
         ends = [c.scene.simulate(c.state, [c.control] * count, length)[-1] for c in cases]
         for together in (False, True):
-            sample = Ours(method, n).build(Problems(cases), dt, steps, together)
+            sample = ShippedStepping(method, n).build(Problems(cases), dt, steps, together)
             assert np.array_equal(sample.end(), ends), (method, n, together)
 
 
@@ -88,30 +92,33 @@ def test_only_what_is_shipped_counts_as_ours(name, quick, monkeypatch):
     """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
         found = work_precision.rivals(name, horizon, "compiled", quick)
-        assert {r.method for r in found if r.family == "ours"} <= {Ours.METHOD, Ours.ONE_CALL}
+        assert {r.method for r in found if r.family == "ours"} <= {
+            ShippedStepping.METHOD,
+            ShippedStepping.ONE_CALL,
+        }
         assert {r.family for r in found} == {"ours", "compiled"}
         assert not any("series" in r.method for r in found)
     flows = []
-    original = Kernels.__init__
+    original = FlowSteps.__init__
     monkeypatch.setattr(
-        Kernels,
+        FlowSteps,
         "__init__",
         lambda self, scene, flow=None, dt=0.02: (flows.append(flow), original(self, scene, flow, dt))[1],
     )
     case = ensemble(name, 1)[0]
-    Ours(Ours.METHOD, 1).build(Problems([case]), 0.02, 1, False)
+    ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False)
     assert flows == [None]
 
 
 def test_a_refused_step_is_no_point():
     case = ensemble("PivotedBar", 1)[0]._replace(state=(0.0, 1e12))
     with pytest.raises(ArithmeticError, match="refused"):
-        Ours(Ours.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
+        ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
 
 
 def test_kernels_refuse_other_constants():
     with pytest.raises(ValueError, match="compiled for the constants"):
-        Kernels(BAR).arguments(dataclasses.replace(BAR, damping=0.0), 0.02)
+        FlowSteps(BAR).arguments(dataclasses.replace(BAR, damping=0.0), 0.02)
 
 
 # --- rivals: no form is fast because it is broken ---
@@ -127,8 +134,8 @@ def test_kernels_refuse_other_constants():
     ],
 )  # fmt: skip
 def test_steppers_are_accurate(name, method, mode):
-    assert method in Compiled.methods(Problems(ensemble(name, 1)).equation)
-    assert worst(Compiled(method, 32), name, mode == "batch") < 1e-9
+    assert method in CompiledMethod.methods(Problems(ensemble(name, 1)).equation)
+    assert worst(CompiledMethod(method, 32), name, mode == "batch") < 1e-9
 
 
 @pytest.mark.slow
@@ -136,11 +143,12 @@ def test_steppers_are_accurate(name, method, mode):
 def test_all_steppers_are_accurate(name):
     """In every form, and with the same bits in a batch as alone."""
     some = [t.case for t in truths(name, 6)]
-    for method in Compiled.methods(Problems(some).equation):
-        order = METHODS[method.removesuffix(Compiled.CARRIED)].order
-        assert worst(Compiled(method, 256), name, False) < max(10.0 ** (-4 * order + 2), 1e-11), method
+    for method in CompiledMethod.methods(Problems(some).equation):
+        order = METHODS[method.removesuffix(CompiledMethod.CARRIED)].order
+        assert worst(CompiledMethod(method, 256), name, False) < max(10.0 ** (-4 * order + 2), 1e-11), method
         ends = [
-            Compiled(method, 2).build(Problems(some), 0.02, 3, together).end() for together in (False, True)
+            CompiledMethod(method, 2).build(Problems(some), 0.02, 3, together).end()
+            for together in (False, True)
         ]
         assert np.array_equal(*ends), method
 
@@ -148,9 +156,9 @@ def test_all_steppers_are_accurate(name):
 @pytest.mark.parametrize("name", ["PivotedBar", "CylinderInCylinder, tilt", "Incline, moving"])
 def test_held_controls_are_one_call(name):
     """Over many control steps a stepper takes substeps, or one step for several."""
-    fine, coarse = (worst(Compiled("DOP853, carried", n), name, True, 40) for n in (4, 1 / 4))
+    fine, coarse = (worst(CompiledMethod("DOP853, carried", n), name, True, 40) for n in (4, 1 / 4))
     assert fine < 1e-12 and coarse < 1e-2
-    assert Compiled("RK4", 1 / 4).substeps(40) == 10
+    assert CompiledMethod("RK4", 1 / 4).substeps(40) == 10
 
 
 @pytest.mark.parametrize("method", ["dopri5", "dop853", "lsoda", "Radau"])
@@ -242,17 +250,19 @@ def test_a_scene_of_ones_own():
             return np.array(y[:4].T)
 
     exact = 1e-6 * np.cos(np.sqrt(Some.p[0]) * 0.4)
-    found = [Compiled("RK4", 8), Compiled("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
+    found = [CompiledMethod("RK4", 8), CompiledMethod("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
     for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if _has("heyoka") else []):
         for together in (False, True):
             ends = rival.build(Some(), 0.1, 4, together).end()
             assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
     wrong = Some()
     wrong.y = Some.y * np.array([[1.0]] * 4 + [[0.0]] * 4)  # unknowns that are not carried are not used
-    assert Compiled("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(exact, rel=1e-4, abs=0)
+    assert CompiledMethod("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(
+        exact, rel=1e-4, abs=0
+    )
     with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
-        Compiled("ETD4RK", 1).build(Some(), 0.1, 4, False)
-    assert "Verlet" in Compiled.methods(Problems(ensemble("PivotedBar", 1)).equation)
+        CompiledMethod("ETD4RK", 1).build(Some(), 0.1, 4, False)
+    assert "Verlet" in CompiledMethod.methods(Problems(ensemble("PivotedBar", 1)).equation)
 
 
 def _has(package):
@@ -443,8 +453,11 @@ def test_committed_claims_follow_from_the_table():
 def test_only_what_is_shipped_is_committed_as_ours():
     table = next(t for t in committed()["tables"] if t["name"].endswith("targets"))
     ours = {line[table["columns"].index("ours")] for line in table["rows"]} - {None}
-    steps = {f"{Ours.METHOD}, {words}" for words in ("2 substeps", *(f"a step for {n}" for n in (2, 4, 8)))}
-    assert OURS in ours <= {Ours.METHOD, Ours.ONE_CALL} | steps
+    steps = {
+        f"{ShippedStepping.METHOD}, {words}"
+        for words in ("2 substeps", *(f"a step for {n}" for n in (2, 4, 8)))
+    }
+    assert OURS in ours <= {ShippedStepping.METHOD, ShippedStepping.ONE_CALL} | steps
 
 
 def test_jobs_are_brought_to_one_scale():
@@ -470,7 +483,7 @@ def test_errors_below_amplified_rounding_are_none():
 
 def test_a_lost_job_is_a_row_and_claims_nothing():
     """Without rows every claim is open; the problem is stated."""
-    lost = Result("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
+    lost = JobResult("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
     content = work_precision.content([], [lost])
     assert all(claim.holds is None for claim in content.claims)
     assert any("stopped after 120 s" in row for table in content.tables for row in table.rows)
@@ -478,7 +491,9 @@ def test_a_lost_job_is_a_row_and_claims_nothing():
 
 def test_the_picture_has_the_fastest_form_of_each():
     def point(method, ns, error):
-        return Point("PivotedBar", "one step", "single", "compiled", method, 1, error, error, [error], ns)
+        return WorkPrecisionPoint(
+            "PivotedBar", "one step", "single", "compiled", method, 1, error, error, [error], ns
+        )
 
     points = [point("RK4", 50.0, 1e-9), point("RK4, carried", 20.0, 1e-8), point("RK4, carried", 60.0, 1e-8)]
     assert [(p.method, p.ns) for p in diagrams.curves(points)["RK4"]] == [
@@ -509,6 +524,6 @@ def test_targets_are_compared_once():
 
 
 def test_series_are_only_measured_for_their_order():
-    assert all(isinstance(s, Series) for s in work_precision.series(BAR))
+    assert all(isinstance(s, OrderedMethod) for s in work_precision.series(BAR))
     flow = form_of(BAR).flow(0.02)
     assert comparison("RK4", flow, True) is comparison("RK4", flow, True)

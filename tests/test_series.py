@@ -30,7 +30,7 @@ from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.lowering import ELAPSED
-from lag_envs.stepping.machine import Layout, compile_attempt
+from lag_envs.stepping.machine import LaneLayout, compile_attempt
 from lag_envs.stepping.series import (
     LARGEST_ORDER,
     SMALLEST_ORDER,
@@ -38,9 +38,9 @@ from lag_envs.stepping.series import (
     TOLERANCE,
     TRIES,
     Certificate,
-    Lane,
     Plain,
     Series,
+    StepProgress,
 )
 from lag_envs.stepping.tracing import evaluate
 
@@ -116,7 +116,7 @@ def compiled(record, lanes=1, fused=True):
 def attempts(system, cases, order, tolerance):
     """Return for each case (state, control, h) the certified length, 0 if none, and bounds on the tails."""
     record = record_of(system)
-    layout, n = Layout(record), record.size
+    layout, n = LaneLayout(record), record.size
     run, results = compiled(record), []
     for state, control, h in cases:
         rows = np.zeros(layout.rows)
@@ -350,7 +350,7 @@ def test_operations_grow_no_faster_than_the_cube_of_the_number_of_links():
 def rows_of(system, cases):
     """Return a block of rows: for each case inputs, places and velocities."""
     record = record_of(system)
-    layout, n = Layout(record), record.size
+    layout, n = LaneLayout(record), record.size
     rows = np.zeros((2 * layout.bounds + 1, BLOCK))
     for lane, (state, control) in enumerate(cases):
         given, q, v = inputs(system, state, control)
@@ -363,7 +363,7 @@ def rows_of(system, cases):
 def block_steps(system, cases, dt, order, fused=True, **options):
     """Return places, velocities and the status of each lane after a control step of a block."""
     record = record_of(system, fused)
-    layout, rows = Layout(record), rows_of(system, cases)
+    layout, rows = LaneLayout(record), rows_of(system, cases)
     advance = compile_advance_block(record, fused=fused, **options)
     refused = advance(rows.reshape(-1), 0, len(cases), dt, order)
     assert refused == (rows[layout.status, : len(cases)] < 0).sum()
@@ -373,7 +373,7 @@ def block_steps(system, cases, dt, order, fused=True, **options):
 def single_steps(system, cases, dt, order, fused=True):
     """Return the same from the function for a single lane."""
     record = record_of(system, fused)
-    layout, rows = Layout(record), rows_of(system, cases)
+    layout, rows = LaneLayout(record), rows_of(system, cases)
     advance, results = compile_advance(record, fused=fused), []
     for lane in range(len(cases)):
         one = np.zeros(layout.rows)
@@ -423,12 +423,12 @@ def in_python(name, source, *helpers, **constants):
 
 def advance_in_python(record, tolerance=TOLERANCE, fused=False):
     """Replace `compile_advance`: the driver's own code on `Plain`."""
-    series, layout, n = Series(record), Layout(record), record.size
+    series, layout, n = Series(record), LaneLayout(record), record.size
 
     def attempt(rows, at, dt, order, tolerance):
         given = {name: rows[row] for name, row in layout.inputs.items()}
         q, v = (list(rows[first : first + n]) for first in (layout.q, layout.v))
-        lane = Lane(q, v, *rows[layout.status : layout.bounds])
+        lane = StepProgress(q, v, *rows[layout.status : layout.bounds])
         after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
         rows[layout.q : layout.bounds] = [*after.q, *after.v, after.status, after.left, after.wish]
         for row, bound in enumerate(bounds, layout.bounds):
@@ -741,7 +741,7 @@ def test_bits_do_not_depend_on_fused_instructions():
     engine.finalize_object()
     kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_int64, ctypes.c_double)
     attempt = kind(engine.get_function_address("attempt"))
-    layout, rows = Layout(record_of(system)), rows_of(system, [system.draw(np.random.default_rng(14))])
+    layout, rows = LaneLayout(record_of(system)), rows_of(system, [system.draw(np.random.default_rng(14))])
     results = []
     for run in (attempt, compiled(record_of(system))):
         one = np.zeros(layout.rows)

@@ -61,7 +61,7 @@ def test_gradients_are_slopes_of_what_is_earned(env_id, share):
         "n_envs": n, "n_steps": steps, "critic": [8], "gamma": gamma, "episode_share": share,
         "max_slope": 1e9,
     }  # fmt: skip
-    learner = shac.Learner(env_id, shac.Settings.of(settings), 0, 1000)
+    learner = shac.SHACLearner(env_id, shac.SHACSettings.of(settings), 0, 1000)
     start, act = copy.deepcopy(learner.state()), learner.policy.outputs
 
     def earned(push):
@@ -87,7 +87,7 @@ def test_gradients_are_slopes_of_what_is_earned(env_id, share):
 def test_it_swings_the_free_bar_up():
     """In about a second of training; back-propagation through time without bounds stays below .6."""
     hyper = hyperparameters("shac", FREE) | {"n_timesteps": 4e5}
-    learner = shac.Learner(FREE, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
+    learner = shac.SHACLearner(FREE, shac.SHACSettings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:
         learner.iterate()
     assert score(FREE, play(FREE, learner.policy, fresh_seeds(100)).mean()) > 0.9
@@ -97,7 +97,7 @@ def test_it_swings_the_free_bar_up():
 def test_it_keeps_the_bar_up_on_a_track():
     """For ten seconds: a policy that drifts reaches the track's end, drops the bar, and stays below .9."""
     hyper = hyperparameters("shac", TRACK)
-    learner = shac.Learner(TRACK, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
+    learner = shac.SHACLearner(TRACK, shac.SHACSettings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:
         learner.iterate()
     assert score(TRACK, play(TRACK, learner.policy, fresh_seeds(100)).mean()) > 0.97

@@ -130,7 +130,7 @@ class Step:
             targets = given.reshape(n_targets).expand(*shape, n_targets)
         _check("targets", targets, (*shape, n_targets))
         rows = (x.reshape(shape.numel(), x.shape[-1]) for x in (states, actions, targets))
-        found = _Step.apply(self.model, *rows)
+        found = _RowStep.apply(self.model, *rows)
         return StepResult(*(x.reshape((*shape, *x.shape[1:])) for x in found))
 
 
@@ -316,7 +316,7 @@ class TorchVectorEnv:
         return list(results)
 
 
-class _Step(torch.autograd.Function):
+class _RowStep(torch.autograd.Function):
     """`Step`, on rows."""
 
     @staticmethod
@@ -339,15 +339,15 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *seeds: Tensor) -> tuple:
-        return None, *_Back.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
+        return None, *_RowStepBackward.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
-        return _over_batch(_Step, info, in_dims, given)
+        return _over_batch(_RowStep, info, in_dims, given)
 
 
-class _Back(torch.autograd.Function):
-    """The derivatives of `_Step`."""
+class _RowStepBackward(torch.autograd.Function):
+    """The derivatives of `_RowStep`."""
 
     @staticmethod
     def forward(
@@ -383,7 +383,7 @@ class _Back(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
-        return _over_batch(_Back, info, in_dims, given)
+        return _over_batch(_RowStepBackward, info, in_dims, given)
 
 
 class _EnvStep(torch.autograd.Function):

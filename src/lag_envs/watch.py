@@ -23,7 +23,7 @@ GIF_RATE = 25.0
 ALL_HAVE = ("zero", "random")
 
 
-class Known(NamedTuple):
+class NamedAgent(NamedTuple):
     """An agent that has a name.
 
     Attributes
@@ -38,11 +38,11 @@ class Known(NamedTuple):
     about: str
 
 
-def known(task: Any, env_id: str) -> list[Known]:
+def known(task: Any, env_id: str) -> list[NamedAgent]:
     """Return the named agents of an environment, the default one first."""
     found = []
     if (own := shipped().get(env_id)) is not None:
-        found.append(Known(own.name, f"comes with the package, score {own.score:.3f}"))
+        found.append(NamedAgent(own.name, f"comes with the package, score {own.score:.3f}"))
     taken = {agent.name for agent in found}
     controllers = [*task.controllers, *ALL_HAVE]
     if task.reference in controllers:  # a quick one is the default
@@ -51,7 +51,7 @@ def known(task: Any, env_id: str) -> list[Known]:
         if name not in taken:
             entry = task.controllers.get(name)
             plans = ", plans for seconds before each episode" if entry is not None and entry.plans else ""
-            found.append(Known(name, f"controller{plans}"))
+            found.append(NamedAgent(name, f"controller{plans}"))
     return found
 
 
@@ -151,10 +151,10 @@ def _model(env_id: str, path: Path) -> Any:
         raise UserError(
             f"{path} observes {model.observation_space.shape} numbers, {env_id} has {spaces[0].shape}"
         )
-    return Model(model, normalise, spaces[1])
+    return SB3Model(model, normalise, spaces[1])
 
 
-class Model:
+class SB3Model:
     """A Stable-Baselines3 model, given the environment's own observations and returning its actions.
 
     Parameters

@@ -27,7 +27,7 @@ LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "ja
 
 
 @dataclass
-class Settings:
+class BenchmarkSettings:
     """Contents and length of a measurement."""
 
     ids: tuple[str, ...] = tuple(TASKS)
@@ -48,7 +48,7 @@ class Settings:
     checkout: str | None = None  #: docs to write the result into
 
 
-def bench(settings: Settings) -> dict[str, Any]:
+def bench(settings: BenchmarkSettings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return its contents."""
     for name in settings.files:
         registered(name)

@@ -79,7 +79,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
 
 def run_bench(args: argparse.Namespace) -> int:
     """Compare speeds."""
-    from lag_envs.benchmark.measurement import Settings
+    from lag_envs.benchmark.measurement import BenchmarkSettings
     from lag_envs.benchmark.process import in_own_process
 
     ids, files = _measured(args.ids)
@@ -123,7 +123,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "output": args.output,
         "checkout": args.checkout,
     }
-    return in_own_process(Settings(**(quick | given | plain)))
+    return in_own_process(BenchmarkSettings(**(quick | given | plain)))
 
 
 def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:

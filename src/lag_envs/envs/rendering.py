@@ -238,17 +238,17 @@ class Viewer:
             write_readout(image, self._readings(now, seconds, total), self._pen.scale)
         return image
 
-    def _more(self, now: Frame, poses: list[Pose]) -> Iterator[Extra]:
+    def _more(self, now: Frame, poses: list[Pose]) -> Iterator[StyledShape]:
         """Yield trail and arrows."""
         pieces = min(12, len(self._trail) - 1)
         for tip in range(len(self._tips)):
             way = [points[tip] for points in self._trail]
             for i in range(pieces):
                 part = way[i * (len(way) - 1) // pieces : (i + 1) * (len(way) - 1) // pieces + 1]
-                yield Extra(s.Line(part), TRAIL, (i + 1.0) / pieces)
+                yield StyledShape(s.Line(part), TRAIL, (i + 1.0) / pieces)
         if self._forces is not None:
             for arrow, is_control in self._forces.arrows(now, poses):
-                yield Extra(arrow, STYLES["action"] if is_control else FORCE, 1.0)
+                yield StyledShape(arrow, STYLES["action"] if is_control else FORCE, 1.0)
 
     def _readings(self, now: Frame, seconds: float, total: float) -> list[list[Reading]]:
         """Return the rows of the read-out."""
@@ -351,7 +351,7 @@ def tiled(pictures: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uin
 # --- painting ---------------------------------------------------------------------------------------------
 
 
-class Extra(NamedTuple):
+class StyledShape(NamedTuple):
     """A line or an arrow in the plane with a style of its own, and how opaque it is."""
 
     shape: s.Line | s.Arrow
@@ -400,7 +400,7 @@ class Pen:
         self._glass: Glass | None = None
 
     def paint(
-        self, image: NDArray[np.uint8], poses: Sequence[Pose], view: Window, more: Sequence[Extra] = ()
+        self, image: NDArray[np.uint8], poses: Sequence[Pose], view: Window, more: Sequence[StyledShape] = ()
     ) -> None:
         """Paint the shapes, and then the extras in the plane, over an image."""
         places = self._places(poses, view)

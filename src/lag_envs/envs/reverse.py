@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lag_envs.envs.program import constants_of
 from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import pulled
-from lag_envs.stepping.adjoint import Differentiable, Lanes
+from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
@@ -64,7 +64,7 @@ class Reverse:
         sizes |= {"moved": sizes["y"] + sizes["u"] + len(parameters)}
         self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
         self._form = form_of(task.scene)
-        self._compiled: dict[str, Lanes] = {}
+        self._compiled: dict[str, LaneFormula] = {}
 
     def observations(self, states: Array, targets: Array) -> Array:
         """Return the observations of states (n, n_state) with targets (n, n_targets)."""
@@ -125,7 +125,7 @@ class Reverse:
 
     # --- formulas ------------------------------------------------------------------------------------------
 
-    def _lanes(self, name: str, formula: Callable, *arrays: str) -> Lanes:
+    def _lanes(self, name: str, formula: Callable, *arrays: str) -> LaneFormula:
         """Return a formula, compiled on first use; `arrays` are its arguments."""
 
         def of_numbers(xp: Differentiable, numbers: dict[str, Any]) -> list[list]:
@@ -135,15 +135,15 @@ class Reverse:
 
         if name not in self._compiled:
             names = [self._names[array] for array in arrays]
-            self._compiled[name] = Lanes(name, of_numbers, names, self._constants, self._absent)
+            self._compiled[name] = LaneFormula(name, of_numbers, names, self._constants, self._absent)
         return self._compiled[name]
 
-    def _whole(self, kicked: bool) -> Lanes:
+    def _whole(self, kicked: bool) -> LaneFormula:
         name = "whole_kicked" if kicked else "whole"
         formula = partial(self._whole_of, kicked)
         return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
 
-    def _after(self, kicked: bool) -> Lanes:
+    def _after(self, kicked: bool) -> LaneFormula:
         name = "after_kicked" if kicked else "after"
         formula = partial(self._after_of, kicked)
         return self._lanes(name, formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")

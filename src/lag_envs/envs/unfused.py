@@ -55,7 +55,7 @@ from lag_envs.stepping.flows import split
 from lag_envs.stepping.general import stepper_of, usual_order
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
 from lag_envs.stepping.series import TOLERANCE
-from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 
@@ -64,7 +64,7 @@ from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 SINGLE_TOLERANCE = 2.0**-25
 
 
-class Rows(NamedTuple):
+class ScriptRows(NamedTuple):
     """The places of an environment's numbers in ``f``.
 
     Attributes
@@ -160,7 +160,7 @@ class UnfusedProgram:
         ends = np.cumsum((0, *sizes)).tolist()
         self.size = ends[-1] + 3
         y, g, u, o, turned = (slice(a, b) for a, b in pairwise(ends))
-        self.rows = Rows(y, g, u, o, turned, *range(ends[-1], self.size))
+        self.rows = ScriptRows(y, g, u, o, turned, *range(ends[-1], self.size))
         self.frames: list[str] = []
 
     # --- scripts --------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ class UnfusedProgram:
         for name, made in self.made.items():
 
             def follows(xp: Any, *numbers: Any, made: Callable = made, given: tuple = tuple(known)) -> list:
-                return [made(_Numbers(self.task.scene, dict(zip(given, numbers, strict=True))))]
+                return [made(_PartlyRecorded(self.task.scene, dict(zip(given, numbers, strict=True))))]
 
             (known[name],) = t.formula(follows, known)
         for name in self.made:
@@ -290,7 +290,7 @@ class UnfusedProgram:
             found = self._formulas.starts_of(dict(zip(names, ElementaryTrace().inputs(*names), strict=True)))
         except FormulaError:
             return []
-        return [name for name, value in found.items() if isinstance(value, Number)]
+        return [name for name, value in found.items() if isinstance(value, TracedNumber)]
 
     def _start(self, t: Script) -> None:
         formulas, n = self._formulas, self.states
@@ -471,7 +471,7 @@ class UnfusedImperfectProgram(UnfusedProgram):
         self._write(t, self.rows.o, self._run(t, shown, draws, seen))
 
 
-class _Numbers:
+class _PartlyRecorded:
     """A scene with some recorded parameters, to compute those that follow from them."""
 
     def __init__(self, scene: Any, numbers: dict[str, Any]) -> None:

@@ -36,13 +36,13 @@ from lag_envs.leaderboard.log import (
     MOST,
     REMEDY,
     Added,
+    BoardEntry,
     BoardError,
-    Entry,
+    BoardState,
     Hash,
-    Line,
+    LogLine,
     Opened,
     Protocol,
-    State,
     fold,
     load_json,
     parse,
@@ -87,7 +87,7 @@ class Finding:
 # --- what is cheap ------------------------------------------------------------------------------------------
 
 
-def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
+def sound(board: Board, pin: Path | None = None) -> tuple[BoardState, Results]:
     """Return a board's state and its results, by protocol and id, if all cheap checks pass.
 
     Parameters
@@ -113,13 +113,13 @@ def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
 
 
 @dataclass
-class Cheap:
+class CheapChecks:
     """What the cheap checks found, and what they read."""
 
     findings: list[Finding]
     log: bytes = b""
-    lines: list[Line] = field(default_factory=list)
-    state: State = field(default_factory=State)
+    lines: list[LogLine] = field(default_factory=list)
+    state: BoardState = field(default_factory=BoardState)
     results: Results = field(default_factory=dict)
     #: What each submission says of itself, by id.
     abouts: dict[str, About] = field(default_factory=dict)
@@ -129,10 +129,10 @@ class Cheap:
         return any(line.number == number and line.event.prev is not None for line in self.lines)
 
 
-def cheap(board: Board, pin: Path | None = None) -> Cheap:
+def cheap(board: Board, pin: Path | None = None) -> CheapChecks:
     """Make all cheap checks."""
     chain = Finding("log")
-    found = Cheap([chain])
+    found = CheapChecks([chain])
     try:
         found.log = read_log(board.log)
         found.lines, torn = parse(found.log)
@@ -207,7 +207,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
     return found
 
 
-def _submissions(board: Board, found: Cheap) -> Finding:
+def _submissions(board: Board, found: CheapChecks) -> Finding:
     """Compare each submission's files with the log."""
     from lag_envs.leaderboard.submission import Refused, about, digest_of, read_files
 
@@ -238,7 +238,7 @@ def _submissions(board: Board, found: Cheap) -> Finding:
     return finding
 
 
-def _results(board: Board, found: Cheap) -> Finding:
+def _results(board: Board, found: CheapChecks) -> Finding:
     """Compare each result with the log, with the submission, and with itself."""
     finding = Finding("results")
     for entry in found.state.all:
@@ -261,7 +261,7 @@ def _results(board: Board, found: Cheap) -> Finding:
     return finding
 
 
-def _verified_at(found: Cheap, entry: Entry) -> int:
+def _verified_at(found: CheapChecks, entry: BoardEntry) -> int:
     """Return the line that says that an entry was verified."""
     return next(
         line.number
@@ -270,7 +270,7 @@ def _verified_at(found: Cheap, entry: Entry) -> int:
     )
 
 
-def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]:
+def _odd(found: CheapChecks, entry: BoardEntry, result: Mapping[str, Any]) -> Iterator[str]:
     """Yield statements of a result that cannot be true."""
     for name in ("env", "digest", "nonce"):
         if result[name] != getattr(entry, name):
@@ -393,7 +393,7 @@ def head_of(board: Board) -> str:
     return commit
 
 
-def _nonces(board: Board, found: Cheap) -> Finding:
+def _nonces(board: Board, found: CheapChecks) -> Finding:
     """Check each nonce's source: its commit must hold everything the nonce decides, and be in the history."""
     finding = Finding("nonces")
     held, elsewhere = 0, []
@@ -452,7 +452,7 @@ def audit(
     pin: Path | None = None,
     everything: bool = False,
     tell: Callable[[Finding], Any] = lambda finding: None,
-    progress: Callable[[Entry], Any] = lambda entry: None,
+    progress: Callable[[BoardEntry], Any] = lambda entry: None,
 ) -> bool:
     """Make all checks; return True if nothing is wrong.
 
@@ -483,7 +483,7 @@ def audit(
     return not any(finding.wrong for finding in findings)
 
 
-def _playable(board: Board, found: Cheap) -> Iterator[tuple[Entry, dict[str, Any], float, str]]:
+def _playable(board: Board, found: CheapChecks) -> Iterator[tuple[BoardEntry, dict[str, Any], float, str]]:
     """Yield all that can be verified again: entry, result, best return minus random, place for messages."""
     for (number, id), result in found.results.items():
         entry = found.state.boards[number][id]
@@ -495,7 +495,7 @@ def _playable(board: Board, found: Cheap) -> Iterator[tuple[Entry, dict[str, Any
         yield entry, result, scale.best - scale.random, where
 
 
-def _load(board: Board, entry: Entry) -> Any:
+def _load(board: Board, entry: BoardEntry) -> Any:
     from lag_envs.leaderboard.submission import Refused, load
 
     try:
@@ -505,7 +505,7 @@ def _load(board: Board, entry: Entry) -> Any:
     return submission if submission.digest == entry.digest else None  # otherwise already reported
 
 
-def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
+def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
     """Play the recorded episodes of each policy again, and some more that nobody can foresee."""
     from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
@@ -568,7 +568,7 @@ def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
     )
 
 
-def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
+def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
     """Verify every result again, compare all submissions, and play the references."""
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import verify
@@ -592,7 +592,7 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
     return finding
 
 
-def _links(board: Board, found: Cheap) -> Iterator[str]:
+def _links(board: Board, found: CheapChecks) -> Iterator[str]:
     """Yield policies that act alike without being noted, or are noted and do not."""
     neighbours = Neighbours(board)
     for entry in found.state.entries.values():
@@ -613,7 +613,7 @@ def _links(board: Board, found: Cheap) -> Iterator[str]:
                 )
 
 
-def _references(found: Cheap) -> Iterator[str]:
+def _references(found: CheapChecks) -> Iterator[str]:
     """Yield references whose mean return is not the one that the log states."""
     from lag_envs.controllers import make_controller
     from lag_envs.evaluation.rollout import play

@@ -37,10 +37,10 @@ from lag_envs.leaderboard.log import (
     LOG,
     REMEDY,
     Alike,
+    BoardEntry,
     BoardError,
-    Entry,
+    BoardState,
     Protocol,
-    State,
     fold,
     lock,
     locked,
@@ -97,7 +97,7 @@ class Board:
         self.folder = Path(folder)
         self.log = self.folder / LOG
 
-    def read(self) -> State:
+    def read(self) -> BoardState:
         """Return the state that follows from the log; others may be writing to it."""
         return fold(parse(read_log(self.log))[0])
 
@@ -105,7 +105,7 @@ class Board:
         """Return the folder of a submission's files."""
         return self.folder / "submissions" / id
 
-    def result(self, entry: Entry) -> dict[str, Any]:
+    def result(self, entry: BoardEntry) -> dict[str, Any]:
         """Return a verified result; raise a BoardError if the file is not the one that was written then."""
         path = self.result_file(entry)
         try:
@@ -121,7 +121,7 @@ class Board:
         except ValueError as error:
             raise BoardError(f"{path} is not a result: {error}; verify {entry.id} again") from None
 
-    def result_file(self, entry: Entry) -> Path:
+    def result_file(self, entry: BoardEntry) -> Path:
         """Return the path of a submission's result under a protocol."""
         folder = self.folder / "results"
         if entry.protocol > 1:
@@ -129,7 +129,7 @@ class Board:
         return folder / f"{entry.id}.json.gz"
 
     @contextmanager
-    def change(self) -> Iterator[tuple[State, Callable[..., None]]]:
+    def change(self) -> Iterator[tuple[BoardState, Callable[..., None]]]:
         """Hold the board's lock; give its state and a function that appends an event to the log.
 
         Others wait meanwhile. Temporary files left by a kill are removed.
@@ -164,7 +164,7 @@ class Board:
         with self.change() as (state, append):
             return self._open(state, append)
 
-    def _open(self, state: State, append: Callable[..., None]) -> int:
+    def _open(self, state: BoardState, append: Callable[..., None]) -> int:
         from lag_envs.scores import known_returns
 
         known = state.protocols.get(state.number)
@@ -187,7 +187,7 @@ class Board:
         append("protocol", number=number, rules=rules, scales=scales, references=references)
         return number
 
-    def add(self, submission: Submission) -> Entry:
+    def add(self, submission: Submission) -> BoardEntry:
         """Add a submission, unless it is there already, and return its entry.
 
         A board without a protocol begins the first one.
@@ -266,7 +266,7 @@ class Board:
 
     def verified(
         self, id: str, result: Mapping[str, Any], alike: Mapping[str, Alike | None] | None = None
-    ) -> list[Entry]:
+    ) -> list[BoardEntry]:
         """Keep a result, unless the submission is no longer pending.
 
         It replaces the result of the same authors under the same name on the same board, unless the
@@ -335,7 +335,7 @@ class Board:
             yield free
 
 
-def current(state: State, what: str) -> Protocol:
+def current(state: BoardState, what: str) -> Protocol:
     """Return the current protocol; raise a BoardError if this package has other rules."""
     found = state.protocols.get(state.number)
     if found is None:
@@ -351,7 +351,7 @@ def current(state: State, what: str) -> Protocol:
     return found
 
 
-def others(state: State, entry: Entry) -> list[Entry]:
+def others(state: BoardState, entry: BoardEntry) -> list[BoardEntry]:
     """Return all submissions verified on the same board, whatever became of them."""
     return [
         other

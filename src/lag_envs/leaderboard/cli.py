@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.board import Board
-from lag_envs.leaderboard.log import COMMIT, BoardError, Entry, State
-from lag_envs.leaderboard.pending import Check, finish
+from lag_envs.leaderboard.log import COMMIT, BoardEntry, BoardError, BoardState
+from lag_envs.leaderboard.pending import PendingCheck, finish
 from lag_envs.leaderboard.standings import board_data, page_data
 from lag_envs.tables import columns
 
@@ -216,10 +216,10 @@ def _open(args: argparse.Namespace) -> int:
 def _finish(board: Board, args: argparse.Namespace) -> int:
     """Verify pending submissions, with progress on a terminal; return how many could not be verified."""
 
-    def tell(entry: Entry, what: str) -> None:
+    def tell(entry: BoardEntry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
 
-    def parallel_map(check: Check, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
+    def parallel_map(check: PendingCheck, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
         from tqdm import tqdm
 
         from lag_envs.leaderboard.parallel import map_submissions
@@ -286,7 +286,7 @@ def _remark(row: dict[str, Any]) -> str:
     return f" ({'; '.join(remarks)})" if remarks else ""
 
 
-def _some(board: Board) -> State:
+def _some(board: Board) -> BoardState:
     """Return the board's state; raise a BoardError if nothing is on it."""
     from lag_envs.leaderboard.audit import sound
 

@@ -38,7 +38,7 @@ class GridTable(PolicyTable):
         return self
 
 
-class Table(Architecture):
+class GridArchitecture(Architecture):
     """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, those of the edge.
 
     In the table: `axes`, a list of the axes: a state by its name (`lag-envs info ID`), ``target``, a state
@@ -99,7 +99,7 @@ class Table(Architecture):
         for j, axis in enumerate(axes):
             if not (axis[1:] > axis[:-1]).all():
                 raise Refused(f"the nodes of axis_{j} must increase")
-        grid = _Grid(self, axes, arrays["table"])
+        grid = _GridValues(self, axes, arrays["table"])
         if self.kind == "action":
             return _LookUp(self.task, grid)
         listed, largest = self.head.choices, self.head.largest
@@ -107,10 +107,10 @@ class Table(Architecture):
         return LookAhead(self.task, grid.value, tried)
 
 
-class _Grid:
+class _GridValues:
     """Numbers over a grid."""
 
-    def __init__(self, about: Table, axes: list[Array], values: Array) -> None:
+    def __init__(self, about: GridArchitecture, axes: list[Array], values: Array) -> None:
         self.about, self.axes, self.wrapped = about, axes, ObservationDecoder(about.task).wrapped
         self.strides = np.array([math.prod(values.shape[j + 1 :]) for j in range(values.ndim)])
         self.values = np.ascontiguousarray(values).reshape(-1)
@@ -149,7 +149,7 @@ class _Grid:
 class _LookUp(Clocked):
     """Reads actions off a grid."""
 
-    def __init__(self, task: Task, grid: _Grid) -> None:
+    def __init__(self, task: Task, grid: _GridValues) -> None:
         super().__init__(task)
         self.grid = grid
 

@@ -163,7 +163,7 @@ class MLP(Network):
 
     def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
         layers = _Layers(self, arrays)
-        return _Plain(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
+        return _Feedforward(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
 
 
 class GRU(Network):
@@ -240,7 +240,7 @@ class _Layers:
         return self.head.largest * np.tanh(x) if self.made.squash == "tanh" else x
 
 
-class _Plain(Agent):
+class _Feedforward(Agent):
     def __init__(self, layers: _Layers) -> None:
         super().__init__(layers.head)
         self.layers, self.centres = layers, layers.centres
@@ -310,12 +310,12 @@ class Linear(Architecture):
         count = self.head.size
         self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
 
-    def agent(self, arrays: Mapping[str, Array]) -> _Feedback:
+    def agent(self, arrays: Mapping[str, Array]) -> _LinearFeedback:
         """Return the feedback."""
-        return _Feedback(self.head, arrays["gain"], arrays["offset"])
+        return _LinearFeedback(self.head, arrays["gain"], arrays["offset"])
 
 
-class _Feedback(Agent):
+class _LinearFeedback(Agent):
     def __init__(self, head: Head, gain: Array, offset: Array) -> None:
         super().__init__(head)
         self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))

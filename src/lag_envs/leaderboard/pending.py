@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, closed, current
-from lag_envs.leaderboard.log import REMEDY, Alike, BoardError, Entry
+from lag_envs.leaderboard.log import REMEDY, Alike, BoardEntry, BoardError
 from lag_envs.leaderboard.results import check
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Check:
+class PendingCheck:
     """Process a pending submission, here or on another machine.
 
     Parameters
@@ -87,7 +87,7 @@ def finish(
     board: Board,
     only: Sequence[str] | None = None,
     parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
-    tell: Callable[[Entry, str], Any] = lambda entry, what: None,
+    tell: Callable[[BoardEntry, str], Any] = lambda entry, what: None,
 ) -> int:
     """Verify all pending submissions that have a nonce.
 
@@ -115,7 +115,7 @@ def finish(
     if state.waiting():
         current(state, "verify submissions of")
     with ExitStack() as claims:
-        claimed_here: dict[str, tuple[Entry, str]] = {}
+        claimed_here: dict[str, tuple[BoardEntry, str]] = {}
         for entry in state.waiting():
             if only is not None and entry.id not in only:
                 continue
@@ -131,7 +131,7 @@ def finish(
                     claimed_here[entry.id] = entry, nonce
                     continue
             tell(entry, _outcome(board, entry))
-        work = Check({id: (entry.digest, nonce) for id, (entry, nonce) in claimed_here.items()})
+        work = PendingCheck({id: (entry.digest, nonce) for id, (entry, nonce) in claimed_here.items()})
         folders = [board.submission(id) for id in claimed_here]
         neighbours = Neighbours(board)
         for folder, result in (parallel_map or partial(map_submissions, jobs=1))(work, folders):
@@ -165,7 +165,7 @@ class Neighbours:
         self._loaded: dict[str, Submission] = {}
         self._likeness: dict[tuple[str, str], Any] = {}
 
-    def alike(self, entry: Entry, result: Mapping[str, Any], other: Entry) -> Alike | None:
+    def alike(self, entry: BoardEntry, result: Mapping[str, Any], other: BoardEntry) -> Alike | None:
         """Return how near another submission is to one that was just verified; None if they are not alike."""
         from lag_envs.leaderboard.alike import Likeness
         from lag_envs.leaderboard.ranking import policy_error
@@ -182,7 +182,7 @@ class Neighbours:
             return None
         return Alike(id=other.id, actions=found.actions, returns=found.returns)
 
-    def _load(self, entry: Entry) -> Submission:
+    def _load(self, entry: BoardEntry) -> Submission:
         from lag_envs.leaderboard.submission import Refused, load
 
         if entry.id not in self._loaded:
@@ -196,7 +196,7 @@ class Neighbours:
         return self._loaded[entry.id]
 
 
-def _outcome(board: Board, entry: Entry) -> str:
+def _outcome(board: Board, entry: BoardEntry) -> str:
     now = board.read().entry(entry.id)
     if now.state == "pending":
         return "pending, until a nonce is published: `lag-envs leaderboard nonce`"

@@ -31,16 +31,16 @@ from pydantic import Field, create_model
 
 from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
 from lag_envs.leaderboard.fields import Strict, accepted, between, shown
-from lag_envs.leaderboard.grids import Table
+from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, MLP, Linear
 from lag_envs.leaderboard.planning import PlanAhead
 from lag_envs.leaderboard.protocol import Refused
-from lag_envs.leaderboard.tracking import Plan
+from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.tasks import TASKS, resolve
 
 
 @dataclass(frozen=True)
-class Policy:
+class SubmittedPolicy:
     """An architecture with its arrays.
 
     Parameters
@@ -86,7 +86,7 @@ class ControllerTable(PolicyTable):
     numbers: dict[str, Any] = Field(default={})
 
 
-class Controller(Architecture):
+class ControllerPolicy(Architecture):
     """A controller of `lag_envs.controllers`, made for the undisturbed environment.
 
     In the table: `name`, one of the task's controllers, and optionally the table ``numbers`` of its numeric
@@ -131,8 +131,8 @@ ARCHITECTURES: dict[str, type[Architecture]] = {
     "mlp": MLP,
     "gru": GRU,
     "linear": Linear,
-    "plan": Plan,
+    "plan": PlanArchitecture,
     "mpc": PlanAhead,
-    "table": Table,
-    "controller": Controller,
+    "table": GridArchitecture,
+    "controller": ControllerPolicy,
 }

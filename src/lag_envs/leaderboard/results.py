@@ -54,7 +54,7 @@ class Replay(Strict):
         return self
 
 
-class Curve(Strict):
+class ClaimedCurve(Strict):
     """A learning curve."""
 
     seed: Count
@@ -71,10 +71,10 @@ class Claimed(Strict):
     env_steps: Number | None
     seconds: Number | None
     hardware: Text | None
-    curves: list[Curve]
+    curves: list[ClaimedCurve]
 
 
-class Result(Strict):
+class VerificationResult(Strict):
     """What `verify` returns; on a board with `claimed` and `replays`."""
 
     protocol: Count | None = None  # only in old results; otherwise the log has it
@@ -104,7 +104,7 @@ class Result(Strict):
         return self
 
 
-_RESULT: TypeAdapter[Result] = TypeAdapter(Result)
+_RESULT: TypeAdapter[VerificationResult] = TypeAdapter(VerificationResult)
 
 
 def check(result: Any) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def unpacked(content: bytes) -> dict[str, Any]:
     return check(load_json(text))
 
 
-class Axis(Strict):
+class ValueAxis(Strict):
     """An axis of a value function: a state's name, and evenly spaced nodes."""
 
     label: Text
@@ -136,10 +136,10 @@ class Axis(Strict):
     n: Annotated[int, Field(ge=2, le=1000)]
 
 
-class Value(Strict):
+class ValueFunction(Strict):
     """A coarse value function over two entries of the state."""
 
-    axes: Annotated[list[Axis], Field(min_length=2, max_length=2)]
+    axes: Annotated[list[ValueAxis], Field(min_length=2, max_length=2)]
     values: list[list[Number]]
 
     @model_validator(mode="after")
@@ -150,7 +150,7 @@ class Value(Strict):
         return self
 
 
-_VALUE: TypeAdapter[Value] = TypeAdapter(Value)
+_VALUE: TypeAdapter[ValueFunction] = TypeAdapter(ValueFunction)
 
 
 def checked_value(content: bytes) -> dict[str, Any]:
@@ -173,7 +173,7 @@ def build() -> str:
 # --- two of the same ----------------------------------------------------------------------------------------
 
 
-class Comparison(NamedTuple):
+class VerificationComparison(NamedTuple):
     """How two verifications of the same submission differ.
 
     Parameters
@@ -196,7 +196,7 @@ class Comparison(NamedTuple):
 
 def compare(
     result: Mapping[str, Any], other: Mapping[str, Any], way: float, plans: bool = False
-) -> Comparison:
+) -> VerificationComparison:
     """Compare two verifications of the same submission with the same nonce and number of episodes.
 
     Parameters
@@ -246,7 +246,7 @@ def compare(
     of_one = result.get("build") is not None and builds[0] == builds[1]
     if of_one and not same:
         far.append("the bits, though both are of the same build")
-    return Comparison(same, of_one, float(difference), far)
+    return VerificationComparison(same, of_one, float(difference), far)
 
 
 def apart(

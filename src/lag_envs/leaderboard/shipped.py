@@ -55,12 +55,12 @@ def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
 
 def load(env_id: str, folder: Path = FOLDER) -> Any:
     """Return an environment's policy, with the `predict` of Stable-Baselines3."""
-    from lag_envs.leaderboard.policies import Policy, architecture
+    from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
     from lag_envs.leaderboard.submission import read_arrays
 
     made = architecture(env_id, shipped(folder)[env_id].policy)
     file = folder / f"{env_id}.safetensors"
-    return Policy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
+    return SubmittedPolicy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
 
 
 # --- choosing them ------------------------------------------------------------------------------------------

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs.leaderboard.board import Board, closed
 from lag_envs.leaderboard.files import read_plain
-from lag_envs.leaderboard.log import REMEDY, BoardError, Entry, State
+from lag_envs.leaderboard.log import REMEDY, BoardEntry, BoardError, BoardState
 from lag_envs.leaderboard.pending import shown_episodes
 from lag_envs.leaderboard.results import PACKED, checked_value
 from lag_envs.scores import KnownReturns, known_returns, normalised
 from lag_envs.tasks import TASKS
 
 if TYPE_CHECKING:
-    from lag_envs.leaderboard.combined import Agent, Result
+    from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
 
 
 def page_data(board: Board) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     current = state.number or 1
     keys = {(env_id, current): None for env_id in TASKS if not closed(env_id, current, current)}
     frozen = sorted({(e.env, e.protocol) for e in state.all} - set(keys))
-    found: dict[str, dict[Agent, Result]] = {}
+    found: dict[str, dict[AgentIdentity, AgentScore]] = {}
     return {
         "protocol": current,
         "made": made or datetime.now(UTC).date().isoformat(),
@@ -80,16 +80,16 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
 
 def _environment(
     board: Board,
-    state: State,
+    state: BoardState,
     results: Mapping[tuple[int, str], dict[str, Any]],
     env_id: str,
     number: int,
-    reached: dict[Agent, Result],
+    reached: dict[AgentIdentity, AgentScore],
 ) -> dict[str, Any]:
     """Return a board, and note the results of its ranked agents."""
     from lag_envs.evaluation.statistics import ends, iqm, rounded
     from lag_envs.leaderboard import ranking
-    from lag_envs.leaderboard.combined import Agent, Result
+    from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
     from lag_envs.leaderboard.site.scenery import describe
 
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
@@ -133,8 +133,8 @@ def _environment(
             samples = iqm(drawn[id])
             row["interval"] = list(ends(samples))
             if place is not None:
-                agent = Agent(entry.name, tuple(entry.authors))
-                reached[agent] = Result(row["score"], samples, entry.kind)
+                agent = AgentIdentity(entry.name, tuple(entry.authors))
+                reached[agent] = AgentScore(row["score"], samples, entry.kind)
             middle, chosen = shown_episodes(result)
             verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
             row["replays"] = [
@@ -169,7 +169,7 @@ def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     return (known or dict.fromkeys(KnownReturns._fields)) | scale.model_dump()
 
 
-def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:
+def _looks_like(entry: BoardEntry, entries: Iterable[BoardEntry]) -> str:
     """Return another's earlier author or name that looks like this entry's; empty if there is none."""
     from lag_envs.leaderboard.names import lookalike
 

@@ -29,7 +29,7 @@ from lag_envs.leaderboard.architecture import Architecture
 from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.names import wordless
-from lag_envs.leaderboard.policies import Policy, architecture
+from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
 from lag_envs.leaderboard.protocol import Refused
 
 __all__ = ["About", "Refused", "Submission", "about", "digest_of", "load", "read_files", "write"]
@@ -90,7 +90,7 @@ class Submission(About):
         Where it was read.
     """
 
-    policies: tuple[tuple[int, Policy], ...]
+    policies: tuple[tuple[int, SubmittedPolicy], ...]
     folder: Path
 
 
@@ -176,11 +176,11 @@ def load(folder: Path | str) -> Submission:
     files = read_files(folder)
     told = about(files)
     made = told.architecture
-    policies: list[tuple[int, Policy]] = []
+    policies: list[tuple[int, SubmittedPolicy]] = []
     for seed in told.seeds:
         name = f"policy_{seed}.safetensors"
         arrays = read_arrays(name, files[name], made) if made.arrays else {}
-        policy = Policy(made, arrays)
+        policy = SubmittedPolicy(made, arrays)
         try:
             policy.agent()
         except Refused as error:
@@ -328,7 +328,7 @@ def _kind(made: Architecture, trained: bool, stated: Any) -> str:
     return kind
 
 
-def _check_different(policies: Sequence[tuple[int, Policy]]) -> None:
+def _check_different(policies: Sequence[tuple[int, SubmittedPolicy]]) -> None:
     """Refuse the same learned policy under two seeds."""
     first: dict[bytes, int] = {}
     for seed, policy in policies:

@@ -398,7 +398,7 @@ def _leads_negative(expr: Expr) -> bool:
     return expr.sorted_terms()[0][1] < 0
 
 
-class Functions:
+class RecordedFunctions:
     """The namespace ``xp`` of a formula that is recorded."""
 
     pi = math.pi

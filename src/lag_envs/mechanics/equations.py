@@ -46,7 +46,7 @@ class Energies:
 
 
 @dataclasses.dataclass(frozen=True)
-class Equations:
+class EquationsOfMotion:
     """The equations of motion ``Σ_j mass[i, j] a_j = force[i]``, and what goes with them.
 
     Attributes
@@ -81,7 +81,7 @@ def _degree(monomial: Sequence[tuple[Atom, int]]) -> int:
     return sum(n for atom, n in monomial if atom.kind == "velocity")
 
 
-def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -> Equations:
+def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -> EquationsOfMotion:
     """Derive Lagrange's equations.
 
     Parameters
@@ -124,7 +124,7 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
         total = total - derivative(energies.dissipation, v) + energies.applied.get(name, Expr({}))
         force.append(collect(total))
     collected = dataclasses.replace(energies, kinetic=kinetic)
-    return Equations(tuple(names), len(free), mass, linear, tuple(force), collected)
+    return EquationsOfMotion(tuple(names), len(free), mass, linear, tuple(force), collected)
 
 
 def _check_velocities(kinetic: Expr) -> None:

@@ -13,9 +13,9 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, Functions, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, substitute
 from lag_envs.mechanics.equations import Energies, place, velocity
-from lag_envs.mechanics.layout import Layout
+from lag_envs.mechanics.layout import SceneLayout
 
 #: The formulas of a scene and their arguments after ``self``.
 ARGUMENTS: Mapping[str, tuple[str, ...]] = {
@@ -215,7 +215,7 @@ def single(value: Any, what: str = "") -> Expr:
         raise FormulaError(f"{what}returns {value!r:.60}, which is not a real number") from None
 
 
-def record(scene: Any, layout: Layout) -> Record:
+def record(scene: Any, layout: SceneLayout) -> Record:
     """Run all formulas of a scene on symbols.
 
     Raises
@@ -232,7 +232,7 @@ def record(scene: Any, layout: Layout) -> Record:
         {name: Expr.of(control(name)) for name in layout.controls},
         {name: Expr.of(0) for name in layout.absent},
     )
-    xp = Functions()
+    xp = RecordedFunctions()
     given = {"q": q, "v": v, "u": u, "xp": xp}
 
     def run(name: str) -> Any:
@@ -257,7 +257,7 @@ def record(scene: Any, layout: Layout) -> Record:
     return found
 
 
-def check_again(scene: Any, layout: Layout, found: Record) -> None:
+def check_again(scene: Any, layout: SceneLayout, found: Record) -> None:
     """Raise a FormulaError if a formula gives another result when it is run again."""
     again = record(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
@@ -292,7 +292,7 @@ def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
     return poses
 
 
-def _check_controls(scene: Any, layout: Layout, found: Record) -> None:
+def _check_controls(scene: Any, layout: SceneLayout, found: Record) -> None:
     used = {s.name for e in found.exprs() for s in e.symbols() if s.kind == "control"}
     moving = {p.control for p in layout.prescribed}
     for name in layout.controls:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lag_envs.report import reference
 from lag_envs.report.cases import VARIANTS
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import METHODS, comparison
-from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
@@ -36,7 +36,7 @@ COLOURS = {
 }
 
 
-class Free(NamedTuple):
+class FreeMotion(NamedTuple):
     """A scene without drag and drive, and a start."""
 
     scene: Scene
@@ -51,31 +51,33 @@ _SHELL = CylinderInCylinder(control="damping")
 _TOP = 2.0 * math.sqrt(motion_constants_of(_BAR)["alpha"])
 
 FREE = {
-    "bar, 0.1 rad": Free(_BAR, (0.1, 0.0)),
-    "bar, 1.6 rad": Free(_BAR, (1.6, 0.0)),
-    "bar, 2 rad": Free(_BAR, (2.0, 0.0)),
-    "bar, 3.1 rad": Free(_BAR, (3.1, 0.0)),
-    "bar, turning over": Free(_BAR, (0.0, 1.2 * _TOP)),
-    "shell, 1 rad": Free(_SHELL, (1.0, 0.0)),
-    "incline": Free(Incline(tilt=math.pi / 12), (0.0, 1.0)),
+    "bar, 0.1 rad": FreeMotion(_BAR, (0.1, 0.0)),
+    "bar, 1.6 rad": FreeMotion(_BAR, (1.6, 0.0)),
+    "bar, 2 rad": FreeMotion(_BAR, (2.0, 0.0)),
+    "bar, 3.1 rad": FreeMotion(_BAR, (3.1, 0.0)),
+    "bar, turning over": FreeMotion(_BAR, (0.0, 1.2 * _TOP)),
+    "shell, 1 rad": FreeMotion(_SHELL, (1.0, 0.0)),
+    "incline": FreeMotion(Incline(tilt=math.pi / 12), (0.0, 1.0)),
 }
 QUICK = ("bar, 2 rad", "bar, turning over")
 #: Seconds over which positions are compared; each is a whole number of steps.
 STEPS, QUICK_STEPS = 10**7, 10**5
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: long free runs, and balances of driven, damped ones."""
     steps = QUICK_STEPS if quick else STEPS
     names = QUICK if quick else tuple(FREE)
     made = [
-        Job(SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps})
+        ReportJob(
+            SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps}
+        )
         for name in names
         for method in (OURS, *(m for m in METHODS if m in COLOURS))
     ]
     count = 50 if quick else 500
     return made + [
-        Job(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
+        ReportJob(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
         for name in (list(VARIANTS)[:1] if quick else VARIANTS)
     ]
 
@@ -120,7 +122,7 @@ def march(scene: Stepped) -> Callable:
     return compile_function("march", "\n    ".join(lines) + "\n", code.compile())
 
 
-def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
+def run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the lifted states after these numbers of steps; fewer rows if a step was refused."""
     stepped = Stepped(problem.scene, dt=problem.dt)
     largest = stepped.largest_majorant(problem.dt)
@@ -263,7 +265,7 @@ BALANCE = (
 )
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     drifts, grown, balances = (
         [row for row in rows if row["kind"] == kind] for kind in ("drift", "growth", "balance")
@@ -393,22 +395,22 @@ def _summary(drifts: list[Row], steps: int) -> Table | None:
     return Table("conservation", caption, ("start", *methods), rows)
 
 
-def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[Picture]:
+def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[ReportFigure]:
     if drifts:
-        yield Picture(
+        yield ReportFigure(
             "conservation-energy",
             "Relative drift of energy over the number of control steps, the largest so far, without drag"
             " and drive.",
             lambda: _curves(drifts, "steps", "energy", "control steps", "relative drift of energy"),
         )
     if any("length" in row for row in drifts):
-        yield Picture(
+        yield ReportFigure(
             "conservation-length",
             "c² + s² - 1 of the cosine and sine that ours carries along, at the marks of each run.",
             lambda: _lengths([row for row in drifts if row["method"] == OURS and "length" in row]),
         )
     if grown:
-        yield Picture(
+        yield ReportFigure(
             "conservation-growth",
             "Error of θ (incline: x) of our runs against the closed form in 30 digits. Dotted: one "
             "rounding of the start, propagated by that closed form.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.report.points import HORIZONS, MODES, Point
+from lag_envs.report.points import HORIZONS, MODES, WorkPrecisionPoint
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,7 +41,7 @@ ROUNDED = "amplified rounding"
 LOWEST = 1e-17
 
 
-def draw(variant: str, points: Sequence[Point], floor: Mapping[tuple, float]) -> Figure:
+def draw(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapping[tuple, float]) -> Figure:
     """Draw one variant: horizons side by side, alone above, a batch below."""
     from matplotlib.figure import Figure
 
@@ -70,7 +70,7 @@ def draw(variant: str, points: Sequence[Point], floor: Mapping[tuple, float]) ->
     return figure
 
 
-def panel(ax: Axes, points: Sequence[Point], floor: float | None) -> None:
+def panel(ax: Axes, points: Sequence[WorkPrecisionPoint], floor: float | None) -> None:
     """Draw all curves of one horizon and mode."""
     ax.set_xscale("log")
     ax.set_yscale("log")
@@ -91,9 +91,9 @@ def panel(ax: Axes, points: Sequence[Point], floor: float | None) -> None:
         )  # fmt: skip
 
 
-def curves(points: Sequence[Point]) -> dict[str, list[Point]]:
+def curves(points: Sequence[WorkPrecisionPoint]) -> dict[str, list[WorkPrecisionPoint]]:
     """Return a curve for each rival: of all forms of a method, the points that no other form beats."""
-    found: dict[str, list[Point]] = {}
+    found: dict[str, list[WorkPrecisionPoint]] = {}
     for p in points:
         if not p.ours:
             found.setdefault(p.name.partition(",")[0], []).append(p)
@@ -105,11 +105,11 @@ def curves(points: Sequence[Point]) -> dict[str, list[Point]]:
     }
 
 
-def _height(p: Point) -> float:
+def _height(p: WorkPrecisionPoint) -> float:
     return 1.0 if p.diverged or p.error is None else max(p.error, 1.3 * LOWEST)
 
 
-def _curve(ax: Axes, points: Sequence[Point], **style: Any) -> None:
+def _curve(ax: Axes, points: Sequence[WorkPrecisionPoint], **style: Any) -> None:
     if not points:
         return
     ax.plot([p.ns for p in points], [_height(p) for p in points], **style)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.report import overview, page
-from lag_envs.report.content import Picture, Table
+from lag_envs.report.content import ReportFigure, Table
 from lag_envs.report.report import FILE, content_of
 from lag_envs.store import write
 from lag_envs.tables import markdown_table
@@ -27,7 +27,7 @@ from lag_envs.tables import markdown_table
 FIGURES = "images/accuracy"
 LARGEST_SVG = 200_000  #: bytes
 DETAILS = "accuracy-details.md"
-OVERVIEW = Picture(
+OVERVIEW = ReportFigure(
     "overview",
     "Error against run time. The shortest time of one control step in which each method reaches an error, "
     "with only the state, not in a batch. Rivals get their fastest form.",
@@ -36,7 +36,7 @@ OVERVIEW = Picture(
 )
 
 
-class Part(NamedTuple):
+class PagePart(NamedTuple):
     """A part of the page to read: a section of the report, with words that hold for any measurement."""
 
     section: str
@@ -46,7 +46,7 @@ class Part(NamedTuple):
 
 
 PARTS = (
-    Part(
+    PagePart(
         "work_precision",
         "One step of the package's scenes",
         "Bar, incline and shell have dedicated steps. Ours is as shipped, at rounding error; a rival is "
@@ -55,7 +55,7 @@ PARTS = (
         "for each error, with its time as a multiple of ours: below 1 the rival is faster.",
         (),
     ),
-    Part(
+    PagePart(
         "general",
         "One step of scenes defined by energies alone",
         "Here the equations are derived from the energies and stepped by the general Taylor series, which "
@@ -63,7 +63,7 @@ PARTS = (
         "known here only from exact solutions.",
         ("general-double",),
     ),
-    Part(
+    PagePart(
         "environments",
         "Whole episodes",
         "Episodes of random actions, compared with the exact motion under the same controls. Gymnasium's "
@@ -72,7 +72,7 @@ PARTS = (
         "the last column has the error as a multiple of that.",
         ("environment-errors.png",),
     ),
-    Part(
+    PagePart(
         "stability",
         "Stiffness and extremes",
         "Each cell of a map is one control step, for increasing damping and step length. Heavy damping "
@@ -80,21 +80,21 @@ PARTS = (
         "cases, from a bar of 1e-8 m to drives of 1e6: each is either accurate or refused with an error.",
         ("stability-damping-pivotedbar.png", "extreme-cases-map"),
     ),
-    Part(
+    PagePart(
         "conservation",
         "Conservation",
         "Without drag and drive, energy must not change. The table has its largest drift over a very long "
         "run.",
         ("conservation-energy",),
     ),
-    Part(
+    PagePart(
         "bound",
         "The bound",
         "The bound on a step's truncation error is proved ([numerics](numerics.md), [engine](engine.md)). "
         "Here it is compared with the actual truncation errors: every point must lie left of the line.",
         ("bound-scatter",),
     ),
-    Part(
+    PagePart(
         "leave_out",
         "What is left out",
         "A constant that is zero costs no operation, and the state holds only what an environment "
@@ -161,7 +161,7 @@ def generated(project: Path) -> dict[Path, str]:
     return {project / "docs" / name: text for name, text in pages.items()} | speed_texts(speed, project)
 
 
-def drawn(picture: Picture, folder: Path) -> Path:
+def drawn(picture: ReportFigure, folder: Path) -> Path:
     """Draw a figure; one that is too large as SVG becomes PNG."""
     path = page.draw(picture, folder)
     if picture.raster or path.stat().st_size <= LARGEST_SVG:

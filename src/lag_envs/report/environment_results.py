@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.episodes import DIGITS, TIMES
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.runner import JobResult, Row
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS
@@ -33,7 +33,7 @@ BLUE, GREY = "#0072b2", "#666666"
 COLOURS = {"Pendulum-v1": "#d55e00", "CartPole-v1": "#cc79a7", "Acrobot-v1": "#009e73"}
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     cases = {case: [r for r in rows if r["case"] == case] for case in dict.fromkeys(r["case"] for r in rows)}
     episodes = {case: group for case, group in cases.items() if group[0]["seed"] is not None}
@@ -42,7 +42,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     pictures = []
     if episodes:
         pictures = [
-            Picture(
+            ReportFigure(
                 "environment-errors",
                 "Error of whole episodes (the first 1,000 steps of longer ones), relative to the size of the "
                 "state, as the largest up to a time. "
@@ -51,7 +51,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
                 "rounding of the start, propagated in exact arithmetic.",
                 lambda: _draw_all(episodes),
             ),
-            Picture(
+            ReportFigure(
                 "environment-errors-each",
                 "The same, environment by environment. Solid: error of an episode. Dotted: one rounding of "
                 "its start, amplified by the system itself.",

@@ -20,7 +20,7 @@ from lag_envs import TASKS
 from lag_envs.report.environment_results import COMPARED, LONG, RELEASED, content
 from lag_envs.report.episodes import (
     DIGITS,
-    Episode,
+    RecordedEpisode,
     compare,
     entries,
     moved,
@@ -30,7 +30,7 @@ from lag_envs.report.episodes import (
     stepping,
 )
 from lag_envs.report.gymnasium_peers import PEERS, measure, random_episode, watch
-from lag_envs.report.runner import Job, Row
+from lag_envs.report.runner import ReportJob, Row
 from lag_envs.scenes.derivation import order_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.pivoted_bar import SwingUpFree
@@ -42,12 +42,12 @@ SECTION = "environments"
 MOST_STEPS = 1_000
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: one per environment and seed. Quick: one seed, the first second of each episode."""
     seeds = range(1 if quick else 5)
     seconds = 1.0 if quick else None
     made = [
-        Job(
+        ReportJob(
             SECTION, f"{id}, seed {seed}", "environments:ours",
             {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())}, timeout=600.0,
         )
@@ -56,7 +56,7 @@ def jobs(quick: bool) -> list[Job]:
         for seed in seeds
     ]  # fmt: skip
     made += [
-        Job(
+        ReportJob(
             SECTION, f"{id}, seed {seed}", "environments:theirs", {"id": id, "seed": seed, "seconds": seconds}
         )
         for id in PEERS
@@ -67,7 +67,7 @@ def jobs(quick: bool) -> list[Job]:
         free.insert(1, {"id": "", "dt": 0.02})
     names = [f"{f['id'] or 'ours'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free]
     return made + [
-        Job(SECTION, name, "environments:undriven", arguments)
+        ReportJob(SECTION, name, "environments:undriven", arguments)
         for name, arguments in zip(names, free, strict=True)
     ]
 
@@ -90,7 +90,7 @@ def ours(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
     yield row | {"case": id, "seed": seed}
 
 
-def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) -> Row:
+def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool = False) -> Row:
     """Return the row of an episode of ours; if asked, computed twice, with the difference of the two."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
@@ -180,7 +180,7 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
     yield row | {"case": case, "seed": None, "gain": float(energy[-1] / energy[0] - 1.0)}
 
 
-def first(episode: Episode, dt: float) -> Episode:
+def first(episode: RecordedEpisode, dt: float) -> RecordedEpisode:
     """Return the part of an undriven episode that is compared."""
     steps = round(COMPARED / dt)
-    return Episode(episode.states[: steps + 1], episode.controls[:steps], False)
+    return RecordedEpisode(episode.states[: steps + 1], episode.controls[:steps], False)

@@ -32,7 +32,7 @@ TIMES = (1.0, 5.0, 10.0)
 POINTS = 120  #: of a curve in the picture
 
 
-class Episode(NamedTuple):
+class RecordedEpisode(NamedTuple):
     """A recorded episode: ``controls[i]`` was held from ``states[i]`` to ``states[i + 1]``."""
 
     states: Array
@@ -40,7 +40,7 @@ class Episode(NamedTuple):
     terminated: bool
 
 
-def play(env: gym.Env, actions: Iterator[Any]) -> Episode:
+def play(env: gym.Env, actions: Iterator[Any]) -> RecordedEpisode:
     """Record an episode of one of our environments, which has just been reset."""
     inner: Any = env.unwrapped
     states, controls, terminated, truncated = [inner.state], [], False, False
@@ -48,7 +48,7 @@ def play(env: gym.Env, actions: Iterator[Any]) -> Episode:
         _, _, terminated, truncated, _ = env.step(next(actions))
         states.append(inner.state)
         controls.append(inner.control)
-    return Episode(np.array(states), controls, terminated)
+    return RecordedEpisode(np.array(states), controls, terminated)
 
 
 def random_actions(env: gym.Env, seed: int) -> Iterator[Any]:
@@ -106,7 +106,7 @@ def moved(states: Array) -> list[mpf]:
 
 
 def compare(
-    episode: Episode,
+    episode: RecordedEpisode,
     path: list[list[mpf]],
     shifted: list[list[mpf]],
     alone: list[list[mpf]],

@@ -21,12 +21,12 @@ import numpy as np
 
 from lag_envs.report.general_results import CERTIFIED_ORDERS, DT, MEMBERS, MODES, content
 from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
-from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import ends
-from lag_envs.report.rivals import Compiled, Rival
-from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.rivals import CompiledMethod, Rival
+from lag_envs.report.runner import ReportJob, Row, describe
 from lag_envs.report.timing import Sample, interleaved
 from lag_envs.scenes.derivation import order_of
 from lag_envs.stepping.general import series_code_of
@@ -68,30 +68,32 @@ print(process_time() - begin)
 # --- jobs ---
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: exact end states, equality of models, then everything that is timed."""
     names = ["cart-pole"] if quick else list(SYSTEMS)
     families = [f for f in FAMILIES if not (quick and f == "pinocchio")]
     count = 8 if quick else MEMBERS
     made = [
-        Job(SECTION, f"exact: {name}", f"{SECTION}:exact", {"name": name, "count": count}, 900.0)
+        ReportJob(SECTION, f"exact: {name}", f"{SECTION}:exact", {"name": name, "count": count}, 900.0)
         for name in names
     ]
     made += [
-        Job(SECTION, f"model: {name}, {engine}", f"{SECTION}:models", {"name": name, "engine": engine}, 600.0)
+        ReportJob(
+            SECTION, f"model: {name}, {engine}", f"{SECTION}:models", {"name": name, "engine": engine}, 600.0
+        )
         for name in names
         for engine in ENGINES
         if engine in families
     ]
     made += [
-        Job(
+        ReportJob(
             SECTION, f"certificate: {name}", f"{SECTION}:certificate",
             {"name": name, "count": count if quick else 1000}, 300.0,
         )
         for name in names
     ]  # fmt: skip
-    made.append(Job(SECTION, "energy", f"{SECTION}:energy", {"quick": quick}, 600.0))
-    alone = partial(Job, SECTION, timeout=900.0, alone=True)
+    made.append(ReportJob(SECTION, "energy", f"{SECTION}:energy", {"quick": quick}, 600.0))
+    alone = partial(ReportJob, SECTION, timeout=900.0, alone=True)
     made += [
         alone(f"{family}: {name}", f"{SECTION}:points", {"name": name, "family": family, "quick": quick})
         for name in names
@@ -135,11 +137,11 @@ def rivals(family: str, quick: bool) -> list[Rival]:
         kind = ENGINES[family]
         return [kind(method, n) for method, found in kind.settings.items() for n in found[some]]
     ours = [
-        Certified(Certified.method_of(order), tolerance)
+        CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
         for tolerance in TOLERANCES[some]
         for order in ORDERS[some]
     ]
-    others = [Compiled(method, n) for method in ("RK4", "DOP853") for n in SUBSTEPS[method][some]]
+    others = [CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in SUBSTEPS[method][some]]
     return [
         *ours,
         *others,
@@ -156,7 +158,7 @@ def points(name: str, family: str, quick: bool) -> Iterator[Row]:
     problems = SceneProblems(
         system.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)), system
     )
-    clock = Certified(Certified.method_of(CLOCK[1]), CLOCK[0])
+    clock = CertifiedSeries(CertifiedSeries.method_of(CLOCK[1]), CLOCK[0])
     for mode in MODES:
         yield from measured(
             problems, truth, rivals(family, quick), clock, mode, 3 if quick else 9, {"system": name}
@@ -327,7 +329,7 @@ def energy(quick: bool) -> Iterator[Row]:
         yield {"kind": "energy", "method": method, "seconds": steps * DT, "drift": worst}
     problems = SceneProblems(scene, starts, controls)
     for method, n in (("RK4", 4), ("RK4", 32), ("DOP853", 2), ("DOP853", 8)):
-        end = Compiled(method, n).build(problems, DT, steps, False).end()
+        end = CompiledMethod(method, n).build(problems, DT, steps, False).end()
         drift = np.abs(scene.energy(end)["total"] - before) / size
         row = {"kind": "energy", "method": f"{method}, {n} substeps", "seconds": steps * DT}
         yield row | {"drift": float(drift.max()) if np.isfinite(drift).all() else None}

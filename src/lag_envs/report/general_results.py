@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.linkages import SYSTEMS
-from lag_envs.report.motions import Certified
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.motions import CertifiedSeries
+from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.series import TOLERANCE
 
@@ -32,7 +32,7 @@ LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "com
 EQUAL, DRIFT = 1e-12, 1e-9
 
 
-class Best(NamedTuple):
+class BestSetting(NamedTuple):
     """A method's quickest setting that reaches an error."""
 
     ns: float
@@ -66,7 +66,7 @@ OTHERS = (
 COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
 
 
-def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
+def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, BestSetting]]:
     """Return, by system, mode and error, the quickest setting of each column.
 
     Times are in units of ours in one job, by the clock of every job. A method without a batch counts there as
@@ -77,7 +77,7 @@ def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
     for r in points:
         if r["family"] == "ours":
             clocks.setdefault((r["system"], r["mode"]), r["clock"])
-    found: dict[tuple[str, str, float], dict[str, Best]] = {}
+    found: dict[tuple[str, str, float], dict[str, BestSetting]] = {}
     for r in points:
         ns = r["ns"] * clocks.get((r["system"], r["mode"]), r["clock"]) / r["clock"]
         for mode in MODES:
@@ -86,18 +86,18 @@ def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
             for target in TARGETS:
                 here = found.setdefault((r["system"], mode, target), {})
                 if r["error"] <= target and not (column(r) in here and here[column(r)].ns <= ns):
-                    here[column(r)] = Best(ns, label(r))
+                    here[column(r)] = BestSetting(ns, label(r))
     return found
 
 
-def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
+def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content: times at equal errors, equality of models, certificates, first steps, energy."""
     found = best(rows)
     missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
     fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
     claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
     pictures = [
-        Picture(
+        ReportFigure(
             f"general-{slug(name)}",
             f"Error against time, {name}. One control step of {DT:g} s from {MEMBERS} harsh states: worst "
             "error, and CPU time of a state's step; reference: Lagrange's equations by SymPy, Taylor "
@@ -144,7 +144,7 @@ def slug(name: str) -> str:
     return name.replace(",", "").replace(" ", "-")
 
 
-def verdict(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> str:
+def verdict(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> str:
     """Summarise for each column how it compares at equal error."""
     parts = []
     for name in COLUMNS:
@@ -165,15 +165,15 @@ def verdict(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> str:
     )
 
 
-def _cell(here: Mapping[str, Best], name: str) -> float | None:
+def _cell(here: Mapping[str, BestSetting], name: str) -> float | None:
     return round(here[name].ns, 1) if name in here else None
 
 
-def _others(here: Mapping[str, Best]) -> list[tuple[float, str]]:
+def _others(here: Mapping[str, BestSetting]) -> list[tuple[float, str]]:
     return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
 
 
-def times(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> Table:
+def times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
     """Return the quickest setting of each column, by system and error."""
     rows = []
     for (system, of, target), here in found.items():
@@ -203,7 +203,7 @@ def times(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> Table:
     )
 
 
-def _summary(found: Mapping[tuple, Mapping[str, Best]]) -> Table | None:
+def _summary(found: Mapping[tuple, Mapping[str, BestSetting]]) -> Table | None:
     rows = []
     for (system, mode, target), here in found.items():
         if mode == "single" and target in (1e-6, 1e-12) and "lag_envs" in here:
@@ -234,7 +234,7 @@ def _equal(rows: Sequence[Row]) -> Claim:
 
 
 def _accurate(rows: Sequence[Row]) -> Claim:
-    shipped = TOLERANCE, Certified.method_of(usual_order(DT))
+    shipped = TOLERANCE, CertifiedSeries.method_of(usual_order(DT))
     found = [r for r in rows if r["kind"] == "point" and (r["setting"], r["method"]) == shipped]
     worst = max((math.inf if r["error"] is None else r["error"] for r in found), default=0.0)
     return Claim(
@@ -244,7 +244,9 @@ def _accurate(rows: Sequence[Row]) -> Claim:
     )
 
 
-def _fastest(found: Mapping[tuple, Mapping[str, Best]], mode: str, who: str, names: Sequence[str]) -> Claim:
+def _fastest(
+    found: Mapping[tuple, Mapping[str, BestSetting]], mode: str, who: str, names: Sequence[str]
+) -> Claim:
     lost, cases = [], 0
     for (system, of, target), here in found.items():
         others = [(ns, name) for ns, name in _others(here) if name in names]

@@ -13,14 +13,14 @@ import gymnasium as gym
 import numpy as np
 from mpmath import mpf
 
-from lag_envs.report.episodes import DIGITS, Episode, compare, entries, moved, random_actions
+from lag_envs.report.episodes import DIGITS, RecordedEpisode, compare, entries, moved, random_actions
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Row
 from lag_envs.scenes import Acrobot, CartPole, Pendulum
 from lag_envs.scenes.base import Scene
 
 
-class Peer(NamedTuple):
+class GymnasiumPeer(NamedTuple):
     """One of Gymnasium's environments: its equations, and the meaning of its actions."""
 
     scene: Callable[[Any], Scene]  #: from an instance
@@ -38,7 +38,7 @@ class Peer(NamedTuple):
 
 
 PEERS = {
-    "Pendulum-v1": Peer(
+    "Pendulum-v1": GymnasiumPeer(
         lambda env: Pendulum(mass=env.m, length=env.l, gravity=env.g),
         (0, 1),
         "semi-implicit Euler",
@@ -46,7 +46,7 @@ PEERS = {
         lambda env, action: float(np.clip(action, -env.max_torque, env.max_torque)[0]),
         limits=lambda env: [env.max_speed],
     ),
-    "CartPole-v1": Peer(
+    "CartPole-v1": GymnasiumPeer(
         lambda env: CartPole(
             cart_mass=env.masscart, pole_mass=env.masspole, half_length=env.length, gravity=env.gravity
         ),
@@ -55,7 +55,7 @@ PEERS = {
         lambda env: env.tau,
         lambda env, action: env.force_mag if action == 1 else -env.force_mag,
     ),
-    "Acrobot-v1": Peer(
+    "Acrobot-v1": GymnasiumPeer(
         lambda env: Acrobot(
             mass_1=env.LINK_MASS_1, mass_2=env.LINK_MASS_2, length_1=env.LINK_LENGTH_1,
             length_2=env.LINK_LENGTH_2, com_distance_1=env.LINK_COM_POS_1, com_distance_2=env.LINK_COM_POS_2,
@@ -71,7 +71,9 @@ PEERS = {
 }  # fmt: skip
 
 
-def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: bool) -> Episode:
+def watch(
+    env: Any, peer: GymnasiumPeer, actions: Iterator[Any], steps: int, to_the_end: bool
+) -> RecordedEpisode:
     """Record at most so many steps of a peer that has been reset; until its termination, or past it."""
     states, controls, terminated = [np.array(env.state, np.float64)], [], False
     for action in itertools.islice(actions, steps):
@@ -81,10 +83,10 @@ def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: 
         terminated = terminated or bool(over)
         if terminated and to_the_end:
             break
-    return Episode(np.array(states), controls, terminated)
+    return RecordedEpisode(np.array(states), controls, terminated)
 
 
-def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, Episode, int]:
+def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, RecordedEpisode, int]:
     """Return a peer, an episode of it, and its seed: a later one if a speed was clipped with that seed."""
     peer = PEERS[id]
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
@@ -97,7 +99,7 @@ def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[An
         seed += 1000
 
 
-def measure(env: Any, peer: Peer, episode: Episode) -> Row:
+def measure(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row:
     """Return the row of a peer's episode against the exact one."""
     dt = peer.step(env)
     path = solve(env, peer, episode.states[0], episode.controls)
@@ -111,7 +113,7 @@ def measure(env: Any, peer: Peer, episode: Episode) -> Row:
     }
 
 
-def solve(env: Any, peer: Peer, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
+def solve(env: Any, peer: GymnasiumPeer, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
     """Return the exact states of a peer's equations of motion, each control held for one step."""
     oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
     path = [[x if isinstance(x, mpf) else mpf(float(x)) for x in (start[i] for i in peer.order)]]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lag_envs.report import reference
 from lag_envs.report.equations import Problems
 from lag_envs.report.motions import SceneProblems
-from lag_envs.report.peers import Peer
+from lag_envs.report.peers import LibraryRival
 from lag_envs.report.timing import Sample
 from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
 from lag_envs.scenes.base import Scene
@@ -164,7 +164,7 @@ SYSTEMS = {
 }
 
 
-class Engine(Peer):
+class Engine(LibraryRival):
     """A rival with its own model, made of a system's links."""
 
     @property

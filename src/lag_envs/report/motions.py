@@ -162,7 +162,7 @@ class SceneProblems(Problems):
             self._q, self._v = q, v
 
 
-class Certified(Rival):
+class CertifiedSeries(Rival):
     """The general engine at a tolerance and an order, each step certified, in its shipped loops.
 
     The setting is the tolerance; the method names the order. Alone it runs the loop of `Scene.simulate`, in a

@@ -22,14 +22,14 @@ from lag_envs import own_files
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.errors import UserError
 from lag_envs.report import general, general_results
-from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
+from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.oracle import Unresolved
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import ends
-from lag_envs.report.rivals import Compiled, Rival
-from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.rivals import CompiledMethod, Rival
+from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import order_of
@@ -154,7 +154,7 @@ def subject(file: str, name: str) -> Subject:
 # --- jobs ---
 
 
-def jobs(quick: bool, file: str = "") -> list[Job]:
+def jobs(quick: bool, file: str = "") -> list[ReportJob]:
     """Return the jobs: errors and certificate, stability, then all that is timed."""
     if not file:
         return []
@@ -167,7 +167,7 @@ def jobs(quick: bool, file: str = "") -> list[Job]:
     }
     names = [s.name for s in subjects(file)]
     return [
-        Job(
+        ReportJob(
             SECTION,
             f"{what}: {name}",
             f"{SECTION}:{what}",
@@ -229,14 +229,16 @@ def points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
     problems = SceneProblems(s.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)))
     some: slice = slice(-1, None, -3) if quick else slice(None)
     ours: list[Rival] = [
-        Certified(Certified.method_of(order), tolerance)
+        CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
         for tolerance in TOLERANCES[some]
         for order in ORDERS[some]
     ]
-    ours += [Compiled(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]]
+    ours += [
+        CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]
+    ]
     ours += [CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]]
     others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
-    clock = Certified(Certified.method_of(16), 1e-12)
+    clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
     for mode in general_results.MODES:
         for rivals in (ours, others):
             yield from general.measured(
@@ -301,12 +303,12 @@ def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
 # --- results ---
 
 
-def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
+def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content."""
     names = list(dict.fromkeys(str(r.get("subject", r.get("system"))) for r in rows))
     found, factors = general_results.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
     pictures = [
-        Picture(
+        ReportFigure(
             f"own-{general_results.slug(name)}",
             f"Error against time, {name}. One control step from {MEMBERS} states at most, {FEW} in a quick "
             "report: worst error, and CPU time of a state's step; reference: Taylor series of SymPy's "
@@ -381,7 +383,7 @@ def _steps(rows: Sequence[Row]) -> Table:
     )
 
 
-def _times(found: Mapping[tuple, Mapping[str, general_results.Best]], mode: str) -> Table:
+def _times(found: Mapping[tuple, Mapping[str, general_results.BestSetting]], mode: str) -> Table:
     return dataclasses.replace(general_results.times(found, mode), name=f"own-times-{mode}")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lag_envs import store
-from lag_envs.report.content import Content, Picture, Table
+from lag_envs.report.content import Content, ReportFigure, Table
 
 VERDICTS = {True: "holds", False: "does not hold", None: "not measured"}
 
@@ -52,12 +52,12 @@ def tables(content: Content, details: bool = False) -> list[Table]:
     return list(unique.values())
 
 
-def file_of(picture: Picture) -> str:
+def file_of(picture: ReportFigure) -> str:
     """Return the name of a figure's file."""
     return f"{picture.name}.{'png' if picture.raster else 'svg'}"
 
 
-def draw(picture: Picture, folder: Path) -> Path:
+def draw(picture: ReportFigure, folder: Path) -> Path:
     """Write a figure; the file depends only on the drawing."""
     import matplotlib
 

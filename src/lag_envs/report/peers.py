@@ -27,7 +27,7 @@ TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 SUBSTEPS = (1, 4, 16, 64)
 
 
-class Peer(Rival):
+class LibraryRival(Rival):
     """A rival from another library."""
 
     #: The methods to measure, each with tolerances or substeps.
@@ -49,7 +49,7 @@ class Peer(Rival):
 # --- SciPy ---
 
 
-class SciPy(Peer):
+class SciPy(LibraryRival):
     """SciPy's solvers with a compiled right-hand side.
 
     dopri5, dop853 and lsoda are those of `scipy.integrate.ode`, whose loops are compiled and take a tenth of
@@ -163,7 +163,7 @@ def _rate_of_many(equation: Equation) -> Callable:
 # --- heyoka ---
 
 
-class Heyoka(Peer):
+class Heyoka(LibraryRival):
     """heyoka's adaptive Taylor series, of an order chosen from the tolerance, with fast_math.
 
     For one step per control, its compiled step is called from a compiled loop, so that no call from Python
@@ -314,7 +314,7 @@ def _loop() -> Callable:
 # --- diffrax ---
 
 
-class Diffrax(Peer):
+class Diffrax(LibraryRival):
     """diffrax in one call compiled by XLA: a loop over single states, or a map over a batch.
 
     Its controller chooses each state's steps, or all steps have one length ("fixed").
@@ -384,7 +384,7 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
 # --- torchdiffeq ---
 
 
-class Torchdiffeq(Peer):
+class Torchdiffeq(LibraryRival):
     """torchdiffeq on tensors of all states, which share their steps; its loop over steps is in Python."""
 
     family = "torchdiffeq"
@@ -449,7 +449,7 @@ MODELS: dict[type[Scene], str] = {
 }
 
 
-class MuJoCo(Peer):
+class MuJoCo(LibraryRival):
     """MuJoCo's own dynamics in its compiled rollouts, one state after the other; it has no batch."""
 
     family = "mujoco"
@@ -503,4 +503,6 @@ class MuJoCo(Peer):
         return Sample(run, len(models) * steps, ends=lambda: ends[:, 1:].copy())
 
 
-PEERS: dict[str, type[Peer]] = {peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)}
+PEERS: dict[str, type[LibraryRival]] = {
+    peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)
+}

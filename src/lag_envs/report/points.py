@@ -19,7 +19,7 @@ LIBRARIES = {
 }
 
 
-class Point(NamedTuple):
+class WorkPrecisionPoint(NamedTuple):
     """One method at one setting, in one form: its errors and its time."""
 
     variant: str
@@ -65,7 +65,7 @@ class Point(NamedTuple):
         return f"{self.name}, {self.setting:g}"
 
 
-def gathered(rows: Sequence[Row]) -> list[Point]:
+def gathered(rows: Sequence[Row]) -> list[WorkPrecisionPoint]:
     """Return the points, with all times as on a machine of one speed.
 
     Each job has timed ours in turn with its own samples, as its clock. Times are multiplied by the ratio of
@@ -76,7 +76,7 @@ def gathered(rows: Sequence[Row]) -> list[Point]:
     found = []
     for row in measured:
         key = row["variant"], row["horizon"], row["mode"]
-        point = Point(
+        point = WorkPrecisionPoint(
             *key, row["family"], row["method"], row["setting"], row["error"], row["median"], row["errors"],
             row["ns"] * clocks.get(key, row["clock"]) / row["clock"],
         )  # fmt: skip

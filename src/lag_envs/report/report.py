@@ -14,7 +14,7 @@ from typing import Any
 from lag_envs import store
 from lag_envs.host import machine
 from lag_envs.report.content import Content
-from lag_envs.report.runner import Result, module, run_jobs, versions
+from lag_envs.report.runner import JobResult, module, run_jobs, versions
 from lag_envs.tables import columns
 
 #: Modules of this package, in the order of the page.
@@ -23,7 +23,7 @@ FILE = "report.json"
 
 
 @dataclass
-class Settings:
+class ReportSettings:
     """Extent and destination of a report."""
 
     folder: str = "report"
@@ -38,7 +38,7 @@ class NotAReport(ValueError):
     """The folder holds something else."""
 
 
-def make_report(settings: Settings) -> bool:
+def make_report(settings: ReportSettings) -> bool:
     """Measure what the folder lacks and write everything; return False if interrupted.
 
     Raises
@@ -79,7 +79,9 @@ def prepare(folder: Path) -> Path:
     return folder
 
 
-def collect(settings: Settings, results: Sequence[Result], complete: bool, seconds: float) -> dict[str, Any]:
+def collect(
+    settings: ReportSettings, results: Sequence[JobResult], complete: bool, seconds: float
+) -> dict[str, Any]:
     """Return all measurements, by section."""
     return {
         "complete": complete,
@@ -101,7 +103,7 @@ def collect(settings: Settings, results: Sequence[Result], complete: bool, secon
 def content_of(found: dict[str, Any]) -> dict[str, Content]:
     """Return each section's content."""
     return {
-        name: module(name).content(part["rows"], [Result(**problem) for problem in part["problems"]])
+        name: module(name).content(part["rows"], [JobResult(**problem) for problem in part["problems"]])
         for name, part in found["sections"].items()
     }
 

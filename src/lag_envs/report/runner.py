@@ -36,7 +36,7 @@ LIBRARIES = (
 
 
 @dataclass(frozen=True)
-class Job:
+class ReportJob:
     """A piece of work that takes seconds.
 
     ``function``, as "module:name" within this package or "package.module:name", is called with the arguments
@@ -58,7 +58,7 @@ class Job:
 
 
 @dataclass
-class Result:
+class JobResult:
     """A job's outcome."""
 
     section: str
@@ -90,8 +90,8 @@ def versions() -> dict[str, str]:
 
 
 def run_jobs(
-    jobs: Sequence[Job], folder: Path, processes: int, tell: Callable[[str], None] = lambda text: None
-) -> tuple[list[Result], bool]:
+    jobs: Sequence[ReportJob], folder: Path, processes: int, tell: Callable[[str], None] = lambda text: None
+) -> tuple[list[JobResult], bool]:
     """Run the jobs that have no result in the folder yet.
 
     Parameters
@@ -120,7 +120,7 @@ def run_jobs(
     complete = True
     with progress(len(todo)) as advance:
 
-        def keep(result: Result) -> None:
+        def keep(result: JobResult) -> None:
             known[result.key] = result
             store.append(file, vars(result))
             advance(f"{result.section}: {result.name}")
@@ -137,16 +137,16 @@ def run_jobs(
     return [known[job.key] for job in jobs if job.key in known], complete
 
 
-def load(file: Path) -> list[Result]:
+def load(file: Path) -> list[JobResult]:
     """Return the results in a file; a line that was cut off by a kill is skipped."""
     results = []
     for row in store.rows(file):
         with suppress(TypeError):
-            results.append(Result(**row))
+            results.append(JobResult(**row))
     return results
 
 
-def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterator[Result]:
+def _in_processes(jobs: Sequence[ReportJob], folder: Path, count: int) -> Iterator[JobResult]:
     with (
         TemporaryDirectory(dir=folder, prefix="rows-") as rows,
         processes(count, _begin, str(folder)) as submit,
@@ -161,7 +161,7 @@ def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterator[Res
             elif isinstance(outcome, BaseException):
                 outcome = died(outcome), 0.0
             # Including the rows from before it died.
-            yield Result(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
+            yield JobResult(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
 
 
 def _begin(folder: str) -> None:

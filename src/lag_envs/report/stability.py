@@ -12,7 +12,7 @@ from lag_envs.report import extremes, reference
 from lag_envs.report.cases import Case, scales
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.integrators import comparison
-from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.runner import ReportJob, Row, describe
 from lag_envs.report.stability_maps import MAPS
 from lag_envs.report.stability_results import (
     DIVERGED,
@@ -35,9 +35,9 @@ SECTION = "stability"
 PRECISIONS: dict[str, type[np.floating]] = {"float64": np.float64, "float32": np.float32}
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the section's jobs: one for every row of a map, and the named cases."""
-    found: list[Job] = []
+    found: list[ReportJob] = []
     for title, map in MAPS.items():
         low, high = map.exponents
         values = _decades(low, high, 7 if quick else 2 * (high - low) + 1)
@@ -46,11 +46,13 @@ def jobs(quick: bool) -> list[Job]:
                 continue
             for dt in _decades(-6, 0, 5 if quick else 13):
                 arguments = {"map": title, "name": name, "dt": dt, "values": values}
-                found.append(Job(SECTION, f"{name}, {title}, step {dt:.2g} s", "stability:cells", arguments))
+                found.append(
+                    ReportJob(SECTION, f"{name}, {title}, step {dt:.2g} s", "stability:cells", arguments)
+                )
     cases = list(extremes.QUICK if quick else extremes.EXTREMES)
     parts = 2 if quick else 6
     return found + [
-        Job(SECTION, f"extreme cases {i + 1}", "stability:cases", {"names": cases[i::parts]})
+        ReportJob(SECTION, f"extreme cases {i + 1}", "stability:cases", {"names": cases[i::parts]})
         for i in range(parts)
     ]
 

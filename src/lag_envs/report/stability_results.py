@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lag_envs.report import extremes
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.extremes import EXACT
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.runner import JobResult, Row
 from lag_envs.report.stability_maps import MAPS, STARTS
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ SPECIAL = {DIVERGED: "black", REFUSED: "#d55e00", TOO_LONG: "#d0d0d0", NO_REFERE
 LOWEST, HIGHEST = -17, 2
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     cells = [row for row in rows if row["kind"] == "cell"]
     found = [row for row in rows if row["kind"] == "case"]
@@ -200,7 +200,7 @@ def _amplified(cells: Sequence[Row]) -> Table | None:
     return Table("stability-amplified", caption, columns, lines) if lines else None
 
 
-def _problem_table(problems: Sequence[Result], rows: Sequence[Row]) -> Table | None:
+def _problem_table(problems: Sequence[JobResult], rows: Sequence[Row]) -> Table | None:
     lines = [[p.name, p.problem] for p in problems]
     lines += [
         [f"{row['name']}, {row['map']} {row['x']:.2g}, step {row['dt']:.2g} s", row["problem"]]
@@ -221,14 +221,14 @@ def _cell_table(cells: Sequence[Row]) -> Table:
     return Table("stability-cells", "Every cell of every map.", columns, lines)
 
 
-def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> list[Picture]:
+def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> list[ReportFigure]:
     pictures = []
     for (map, name), rows in maps.items():
         for n, times in (("", "in one step"), (", 16", "in 16 steps")):
             if n and (map, name) != ("damping", "PivotedBar"):
                 continue
             pictures.append(
-                Picture(
+                ReportFigure(
                     f"stability-{map}-{_slug(name)}{n.replace(', ', '-')}",
                     f"{name}: error of one control step over {MAPS[map].label} and the step; comparison "
                     f"integrators {times}. Beside each map the same in float32. Start {STARTS[name][0]}. "
@@ -240,7 +240,7 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
     measured = [row for row in found if row.get("peers")]
     if measured:
         pictures.append(
-            Picture(
+            ReportFigure(
                 "extreme-cases-map",
                 "The named cases: log10 of the error of one control step, ours beside the comparison "
                 "integrators in one step and in 16. Cases that should be refused are in the table only.",

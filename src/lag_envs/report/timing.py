@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 K = TypeVar("K")
 
 
-class Kernels:
+class FlowSteps:
     """The steps of a scene by one flow.
 
     Parameters
@@ -167,7 +167,7 @@ class Sample(NamedTuple):
         return self.ends()
 
 
-def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: float) -> Sample:
+def one_by_one(kernels: FlowSteps, cases: Sequence[Case], controls: Array, dt: float) -> Sample:
     """Return the sample of trajectories one after the other.
 
     Parameters
@@ -188,7 +188,7 @@ def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: flo
     return Sample(lambda: several(paths, given, *arguments), controls.size, ends=lambda: paths[:, -1])
 
 
-def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> Sample:
+def at_once(kernels: FlowSteps, cases: Sequence[Case], steps: int, dt: float) -> Sample:
     """Return the sample of a batch, each state with its control held for some steps."""
     batch, arguments = kernels.batch, kernels.arguments(cases[0].scene, dt)
     start = kernels.fill(cases)

@@ -13,10 +13,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lag_envs.report.cases import VARIANTS
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.diagrams import draw
-from lag_envs.report.points import HORIZONS, LIBRARIES, MODES, Point, gathered
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.points import HORIZONS, LIBRARIES, MODES, WorkPrecisionPoint, gathered
+from lag_envs.report.runner import JobResult, Row
 
 OURS = "lag_envs"
 ROUNDING = 2.0**-53
@@ -41,15 +41,15 @@ def floors(rows: Sequence[Row]) -> dict[tuple, float]:
     }
 
 
-class Comparison(NamedTuple):
+class Duel(NamedTuple):
     """The fastest of ours and the fastest rival that reach an error, on one variant, horizon and mode."""
 
     variant: str
     horizon: str
     mode: str
     target: float
-    ours: Point | None
-    rival: Point | None
+    ours: WorkPrecisionPoint | None
+    rival: WorkPrecisionPoint | None
 
     @property
     def ratio(self) -> float | None:
@@ -67,7 +67,7 @@ class Comparison(NamedTuple):
         return f"{self.variant} {MODES[self.mode]}"
 
 
-def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Comparison]:
+def compared(points: Sequence[WorkPrecisionPoint], floor: dict[tuple, float]) -> list[Duel]:
     """Return all comparisons, with errors up to `ROUNDINGS` amplified roundings counting as none."""
     found = []
     for variant in VARIANTS:
@@ -78,7 +78,7 @@ def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Compari
                 for target in TARGETS if here else ():
                     reached = [p for p in here if p.worst <= max(target, least)]
                     found.append(
-                        Comparison(
+                        Duel(
                             variant, horizon, mode, target,
                             min((p for p in reached if p.ours), key=lambda p: p.ns, default=None),
                             min((p for p in reached if not p.ours), key=lambda p: p.ns, default=None),
@@ -87,7 +87,7 @@ def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Compari
     return found
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section."""
     points = gathered(rows)
     floor = floors(rows)
@@ -98,7 +98,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         text=[*_text(rows), *findings(found)],
         tables=[_targets(found), _near(points), _orders(rows), _failed(rows, problems)],
         pictures=[
-            Picture(_file(name), _caption(name), partial(draw, name, points, floor)) for name in variants
+            ReportFigure(_file(name), _caption(name), partial(draw, name, points, floor)) for name in variants
         ],
         claims=claims(rows, points, found),
         summary=_summary(points, found),
@@ -141,7 +141,7 @@ def _text(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def findings(found: Sequence[Comparison]) -> list[str]:
+def findings(found: Sequence[Duel]) -> list[str]:
     """Return, for every horizon, a paragraph on who is faster at which error, and by how much."""
     paragraphs = []
     for horizon in HORIZONS:
@@ -152,7 +152,7 @@ def findings(found: Sequence[Comparison]) -> list[str]:
     return paragraphs
 
 
-def _finding(found: Sequence[Comparison]) -> str:
+def _finding(found: Sequence[Duel]) -> str:
     """Return who is faster at one error, as a clause that counts every comparison."""
     settled = sorted((d for d in found if d.ratio is not None), key=lambda d: d.ratio or 0.0)
     lost = [d for d in settled if d.lost]
@@ -187,7 +187,7 @@ def _listed(parts: Iterable[str]) -> str:
 # --- tables ---
 
 
-def _targets(found: Sequence[Comparison]) -> Table:
+def _targets(found: Sequence[Duel]) -> Table:
     return Table(
         "work_precision_targets",
         "The fastest form of ours and of all others that reaches an error; below 1 the other is "
@@ -211,7 +211,7 @@ def _targets(found: Sequence[Comparison]) -> Table:
 NEAR = 10.0
 
 
-def _near(points: Sequence[Point]) -> Table:
+def _near(points: Sequence[WorkPrecisionPoint]) -> Table:
     table = _rivals(points)
     rows = [row for row in table.rows if min(x for x in row[3:-1] if x is not None) <= NEAR]
     return Table(
@@ -219,7 +219,7 @@ def _near(points: Sequence[Point]) -> Table:
     )
 
 
-def _rivals(points: Sequence[Point]) -> Table:
+def _rivals(points: Sequence[WorkPrecisionPoint]) -> Table:
     """Return every rival's shortest time to each error, for one step."""
     rows = []
     here = [p for p in points if p.horizon == "one step" and not p.ours]
@@ -242,12 +242,12 @@ def _rivals(points: Sequence[Point]) -> Table:
     )
 
 
-def _default(points: Sequence[Point], variant: str, mode: str) -> Point | None:
+def _default(points: Sequence[WorkPrecisionPoint], variant: str, mode: str) -> WorkPrecisionPoint | None:
     key = variant, "one step", mode, OURS
     return next((p for p in points if (p.variant, p.horizon, p.mode, p.method) == key), None)
 
 
-def _summary(points: Sequence[Point], found: Sequence[Comparison]) -> Table:
+def _summary(points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> Table:
     rows = []
     for name in VARIANTS:
         for mode, words in MODES.items():
@@ -270,7 +270,7 @@ def _summary(points: Sequence[Point], found: Sequence[Comparison]) -> Table:
     )
 
 
-def _rival(comparison: Comparison) -> str:
+def _rival(comparison: Duel) -> str:
     return (
         f"{comparison.rival.label}: {comparison.ratio:.2g} ×"
         if comparison.rival and comparison.ratio
@@ -293,7 +293,7 @@ def _orders(rows: Sequence[Row]) -> Table:
     )
 
 
-def _failed(rows: Sequence[Row], problems: Sequence[Result]) -> Table:
+def _failed(rows: Sequence[Row], problems: Sequence[JobResult]) -> Table:
     found = [[result.name, "", "", result.problem] for result in problems]
     found += [
         [row["variant"], f"{row['horizon']}, {MODES[row['mode']]}", _setting(row), row["problem"]]
@@ -329,7 +329,7 @@ def _setting(row: Row) -> str:
     return f"{LIBRARIES.get(row['family'], '')} {row['method']}, {row['setting']:g}".strip()
 
 
-def _all(points: Sequence[Point]) -> Table:
+def _all(points: Sequence[WorkPrecisionPoint]) -> Table:
     return Table(
         "work_precision_points",
         "All points: largest and median error, members lost, time of a control step.",
@@ -344,7 +344,7 @@ def _all(points: Sequence[Point]) -> Table:
 # --- claims ---
 
 
-def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Comparison]) -> list[Claim]:
+def claims(rows: Sequence[Row], points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> list[Claim]:
     """Return the claims; whether they hold is measured, and README lists those that do not."""
     made = [_fastest(found, horizon, target) for horizon, target in CLAIMED.items()]
     steps = [p for p in points if p.ours and p.method == OURS and p.horizon == "one step"]
@@ -396,7 +396,7 @@ def _claim(text: str, measured: Any, holds: Callable[[], bool], evidence: Callab
     return Claim(text, holds(), evidence()) if measured else Claim(text, None, "not measured")
 
 
-def _fastest(found: Sequence[Comparison], horizon: str, target: float) -> Claim:
+def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
     here = [d for d in found if d.horizon == horizon and d.target == target and (d.ours or d.rival)]
     lost = [d for d in here if d.lost]
 
@@ -427,7 +427,7 @@ def _fastest(found: Sequence[Comparison], horizon: str, target: float) -> Claim:
 LOW = ("explicit Euler", "semi-implicit Euler", "Verlet", "implicit midpoint", "Euler", "implicitfast")
 
 
-def _finest(points: Sequence[Point]) -> dict[tuple[str, str], float]:
+def _finest(points: Sequence[WorkPrecisionPoint]) -> dict[tuple[str, str], float]:
     """Return the smallest error that each form of each rival has in one step, by method and place."""
     found: dict[tuple[str, str], float] = {}
     for p in points:

@@ -21,10 +21,10 @@ from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
 from lag_envs.report.integrators import METHODS, comparison, plain_series
 from lag_envs.report.points import MODES
-from lag_envs.report.rivals import Compiled, Ours, Rival
-from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.rivals import CompiledMethod, Rival, ShippedStepping
+from lag_envs.report.runner import ReportJob, Row, describe
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.timing import Kernels, Sample, interleaved
+from lag_envs.report.timing import FlowSteps, Sample, interleaved
 from lag_envs.report.verdicts import ROUNDING, content
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.flows import Flow
@@ -76,12 +76,12 @@ def control_step(variant: str) -> float:
     return round(VARIANTS[variant].dt * 2**36) / 2**36
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: references, then points of ours and of the usual integrators, then of libraries."""
     names = QUICK_VARIANTS if quick else tuple(VARIANTS)
     horizons = QUICK if quick else HORIZONS
     made = [
-        Job(
+        ReportJob(
             SECTION,
             f"references: {name}, {horizon}",
             f"{SECTION}:references",
@@ -91,7 +91,7 @@ def jobs(quick: bool) -> list[Job]:
         for horizon in horizons
         for name in names
     ]
-    made.append(Job(SECTION, "orders", f"{SECTION}:orders", {"variant": "PivotedBar", "quick": quick}))
+    made.append(ReportJob(SECTION, "orders", f"{SECTION}:orders", {"variant": "PivotedBar", "quick": quick}))
     for name in names:
         kinds = [
             package
@@ -99,7 +99,7 @@ def jobs(quick: bool) -> list[Job]:
             if name in COVERED.get(package, names) and peer.solves(VARIANTS[name].scene())
         ]
         made += [
-            Job(
+            ReportJob(
                 SECTION,
                 f"{family}: {name}",
                 f"{SECTION}:points",
@@ -129,7 +129,7 @@ def _undamped(scene: Scene) -> Scene:
     return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
 
 
-class Truth(NamedTuple):
+class ExactEnd(NamedTuple):
     """The exact end of a problem."""
 
     case: Case
@@ -145,14 +145,14 @@ class Truth(NamedTuple):
         )
 
 
-def truth(case: Case, dt: float, steps: int) -> Truth:
+def truth(case: Case, dt: float, steps: int) -> ExactEnd:
     """Return the exact end; errors of one step are relative to the start's size, later ones to the end's."""
     end = reference.remembered(case.scene, case.state, case.control, dt * steps)
     at = case if steps == 1 else case._replace(state=tuple(map(float, end)))
-    return Truth(case, end, scales(at, dt))
+    return ExactEnd(case, end, scales(at, dt))
 
 
-def truths(variant: str, horizon: str, plan: Horizon) -> list[Truth]:
+def truths(variant: str, horizon: str, plan: Horizon) -> list[ExactEnd]:
     """Return the exact ends of a horizon's members."""
     dt = control_step(variant)
     return [
@@ -161,7 +161,7 @@ def truths(variant: str, horizon: str, plan: Horizon) -> list[Truth]:
     ]
 
 
-def amplified(some: Sequence[Truth], dt: float, steps: int) -> float:
+def amplified(some: Sequence[ExactEnd], dt: float, steps: int) -> float:
     """Return the median effect of one rounding of the start, relative to the scales."""
     from mpmath import mp, mpf
 
@@ -185,7 +185,7 @@ def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
     }  # fmt: skip
 
 
-def errors(some: Sequence[Truth], ends: Array) -> Row:
+def errors(some: Sequence[ExactEnd], ends: Array) -> Row:
     """Return errors of states, the largest and median of those below 1, and the number of lost members."""
     found = [t.error(end) for t, end in zip(some, ends, strict=True)]
     kept = [error for error in found if error < 1.0]
@@ -206,13 +206,16 @@ def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
         equation = Problems(problems(variant, horizon, ensemble(variant, 1))).equation
-        methods = [m for m in Compiled.methods(equation) if not quick or m in QUICK_METHODS]
-        ours = [Ours(Ours.METHOD, 1)]
+        methods = [m for m in CompiledMethod.methods(equation) if not quick or m in QUICK_METHODS]
+        ours = [ShippedStepping(ShippedStepping.METHOD, 1)]
         if plan.seconds is not None:  # a constant control may be stepped with any dt
-            ours += [*(Ours(Ours.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)), Ours(Ours.ONE_CALL, 1)]
+            ours += [
+                *(ShippedStepping(ShippedStepping.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)),
+                ShippedStepping(ShippedStepping.ONE_CALL, 1),
+            ]
         return [
             *ours,
-            *(Compiled(method, n) for method in methods for n in plan.substeps),
+            *(CompiledMethod(method, n) for method in methods for n in plan.substeps),
         ]
     kind = peers.PEERS[family]
     some = slice(1, None, 3) if quick else slice(None)
@@ -258,14 +261,14 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                         at_rounding = row["error"] < 4.0 * ROUNDING
                         no_better = row["error"] > 0.7 * done.get(rival.method, math.inf)
                         done[rival.method] = -1.0 if at_rounding or no_better else row["error"]
-            clock = timed(Ours(Ours.METHOD, 1), base, dt, steps, together)
+            clock = timed(ShippedStepping(ShippedStepping.METHOD, 1), base, dt, steps, together)
             times = interleaved(dict(enumerate([clock, *samples])), 5 if quick else 9)
             for i, row in enumerate(found):
                 yield row | {"ns": times[i + 1], "clock": times[0]}
 
 
 def point(
-    rival: Rival, some: Sequence[Truth], base: Sequence[Case], dt: float, steps: int, together: bool
+    rival: Rival, some: Sequence[ExactEnd], base: Sequence[Case], dt: float, steps: int, together: bool
 ) -> tuple[Row, Sample]:
     """Return the errors of a rival, and the sample for timing it.
 
@@ -344,7 +347,7 @@ def repeated(sample: Sample, times: int) -> Sample:
 # --- orders of convergence ---
 
 
-class Series(NamedTuple):
+class OrderedMethod(NamedTuple):
     """A method whose order is measured."""
 
     method: str
@@ -352,14 +355,16 @@ class Series(NamedTuple):
     order: int
 
 
-def series(scene: Scene, quick: bool = False) -> list[Series]:
+def series(scene: Scene, quick: bool = False) -> list[OrderedMethod]:
     """Return all methods that have an order: ours at several orders, and the usual integrators."""
     found, flow = [], Stepped(scene).flow
     if flow.order:
-        found = [Series(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)]
-    forms = {"": False, Compiled.CARRIED: True}
+        found = [
+            OrderedMethod(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)
+        ]
+    forms = {"": False, CompiledMethod.CARRIED: True}
     found += [
-        Series(name + form, comparison(name, flow, carried), method.order)
+        OrderedMethod(name + form, comparison(name, flow, carried), method.order)
         for name, method in METHODS.items()
         for form, carried in forms.items()
         if not quick or name + form in QUICK_METHODS
@@ -378,15 +383,15 @@ def orders(variant: str, quick: bool) -> Iterator[Row]:
         }  # fmt: skip
 
 
-def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[Truth]]:
+def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[ExactEnd]]:
     """Return the exact ends of single steps of several lengths, each √2 times the previous one."""
     lengths = [round(VARIANTS[variant].dt * 2 ** (k / 2) * 2**36) / 2**36 for k in range(-4, 9)]
     return {h: [truth(case, h, 1) for case in cases] for h in lengths}
 
 
-def measured_order(found: Series, ends: Mapping[float, Sequence[Truth]]) -> float | None:
+def measured_order(found: OrderedMethod, ends: Mapping[float, Sequence[ExactEnd]]) -> float | None:
     """Return the slope of the error of one step over its length, minus one; None if there is none."""
-    kernels = Kernels(next(iter(ends.values()))[0].case.scene, found.flow)
+    kernels = FlowSteps(next(iter(ends.values()))[0].case.scene, found.flow)
     return slope({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
 
 

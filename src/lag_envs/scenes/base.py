@@ -15,7 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics import motion, recording
 from lag_envs.mechanics.algebra import Atom, FormulaError
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLanes, Point, exactly
+from lag_envs.mechanics.evaluation import (
+    DualArray,
+    DualArrayFunctions,
+    LaneArray,
+    LaneArrayFunctions,
+    MotionPoint,
+    Numeric,
+    exactly,
+)
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values, parameter_values
 from lag_envs.scenes import picture, steps
@@ -225,11 +233,11 @@ class Scene(metaclass=SceneType):
 
     # --- derived: numbers ----------------------------------------------------------------------------------
 
-    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
+    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[MotionPoint, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
         states, controls, shape = check_both(self, state, control)
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
-        return Point(self.mechanics, self._symbols(), y, u, Numeric), shape
+        return MotionPoint(self.mechanics, self._symbols(), y, u, Numeric), shape
 
     def _symbols(self) -> dict[Atom, Any]:
         """Return the parameters' values by symbol."""
@@ -272,10 +280,12 @@ class Scene(metaclass=SceneType):
         """
         point, shape = self._point(state, control)
         names = layout_of(self).names
-        q = Values("coordinate", {name: Lanes(point.values[place(name)]) for name in names})
-        v = Values("velocity of a coordinate", {name: Lanes(point.values[velocity(name)]) for name in names})
-        given = self.kinetic(q, v, OfLanes), self.potential(q, OfLanes)
-        kinetic, potential = (x.value if isinstance(x, Lanes) else x for x in given)
+        q = Values("coordinate", {name: LaneArray(point.values[place(name)]) for name in names})
+        v = Values(
+            "velocity of a coordinate", {name: LaneArray(point.values[velocity(name)]) for name in names}
+        )
+        given = self.kinetic(q, v, LaneArrayFunctions), self.potential(q, LaneArrayFunctions)
+        kinetic, potential = (x.value if isinstance(x, LaneArray) else x for x in given)
         energies = {"kinetic": kinetic, "potential": potential, "total": kinetic + potential}
         if self.mechanics.gyroscopic is not None:
             linear, rest = point.of(self.mechanics.gyroscopic)
@@ -342,10 +352,12 @@ class Scene(metaclass=SceneType):
         states, controls, shape = check_both(self, state, control)
         n = states.shape[-1]
         unit = np.eye(n + controls.shape[-1])
-        numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
-        numbers += [Dual(controls[..., i], unit[n + i]) for i in range(controls.shape[-1])]
-        point = Point(self.mechanics, self._symbols(), numbers[:n], numbers[n:], Carrying)
-        slopes = [rate.slope if isinstance(rate, Dual) else np.zeros(len(unit)) for rate in point.rates()]
+        numbers = [DualArray(states[..., i], unit[i]) for i in range(n)]
+        numbers += [DualArray(controls[..., i], unit[n + i]) for i in range(controls.shape[-1])]
+        point = MotionPoint(self.mechanics, self._symbols(), numbers[:n], numbers[n:], DualArrayFunctions)
+        slopes = [
+            rate.slope if isinstance(rate, DualArray) else np.zeros(len(unit)) for rate in point.rates()
+        ]
         both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
         return both[..., :n].copy(), both[..., n:].copy()
 

@@ -11,7 +11,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from lag_envs.mechanics import motion, recording
-from lag_envs.mechanics.layout import Layout, make_layout
+from lag_envs.mechanics.layout import SceneLayout, make_layout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import parameter_names, parameter_values
 from lag_envs.scenes.declaring import MAPPINGS, ORDER, SEQUENCES, controls_of
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
 
 
-def layout_of(scene: Scene) -> Layout:
+def layout_of(scene: Scene) -> SceneLayout:
     """Return the names of coordinates, controls and state."""
     found = vars(scene).get("_cached_layout")
     if found is None:

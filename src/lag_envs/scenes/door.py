@@ -14,7 +14,7 @@ import numpy as np
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.evaluation import Exact, Numeric
-from lag_envs.mechanics.layout import Layout, check_name
+from lag_envs.mechanics.layout import SceneLayout, check_name
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import picture
@@ -27,7 +27,7 @@ from lag_envs.scenes.parameters import fill_in
 SINGULAR = 1e-13
 
 #: Layouts and equations of scenes that passed the checks: by class, and by `structure_of`.
-_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
+_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[SceneLayout, Mechanics]]] = (
     weakref.WeakKeyDictionary()
 )
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import sympy
 from sympy.core.function import AppliedUndef
 
-from lag_envs.mechanics.algebra import FormulaError, Functions
+from lag_envs.mechanics.algebra import FormulaError, RecordedFunctions
 from lag_envs.mechanics.recording import Values, parameter_names, twin
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.parameters import parameter
@@ -255,7 +255,7 @@ def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     if expression.is_Integer:
         return int(expression)
     if expression.is_Rational:
-        exact = isinstance(xp, Functions)
+        exact = isinstance(xp, RecordedFunctions)
         return Fraction(expression.p, expression.q) if exact else expression.p / expression.q
     if expression.is_number and expression.is_real:
         return float(expression)

@@ -14,7 +14,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
-from lag_envs.stepping.series import GROUP, STRIDE, Factor, Lane, Series, Start, Target, times
+from lag_envs.stepping.series import (
+    GROUP,
+    STRIDE,
+    ExpansionStart,
+    Factor,
+    Series,
+    StepProgress,
+    Target,
+    times,
+)
 
 
 class Backward(Series):
@@ -73,12 +82,12 @@ class Backward(Series):
         self,
         t: Any,
         inputs: dict[str, Any],
-        lane: Lane,
+        lane: StepProgress,
         dt: Any,
         order: Any,
         tolerance: Any,
         bars: Sequence,
-    ) -> tuple[Lane, list, Any]:
+    ) -> tuple[StepProgress, list, Any]:
         """Take a substep like `substep`; in lanes where it ends the control step, also take it backwards.
 
         Parameters
@@ -113,7 +122,7 @@ class Backward(Series):
             return [*after.q, *after.v, *after[2:]]
 
         after = t.when(t.negated(t.all(again)), certify, [*lane.q, *lane.v, *lane[2:]])
-        lane = Lane(after[:n], after[n : 2 * n], *after[2 * n :])
+        lane = StepProgress(after[:n], after[n : 2 * n], *after[2 * n :])
         ended = t.either(again, t.both(wanted, t.negated(t.less(zero, lane.left))))
         back = t.most(ended, wanted)
 
@@ -123,7 +132,7 @@ class Backward(Series):
 
         return lane, t.when(back, go_back, bars), back
 
-    def _back(self, t: Target, start: Start, h: Any, order: Any, ends: Sequence) -> list:
+    def _back(self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list:
         """Return cotangents before the step just expanded from those after it, see `pull`."""
         self._clear(t, order)
         n = self.size
@@ -150,7 +159,9 @@ class Backward(Series):
         sources = zip(self._sources, ends[2 * n :], strict=True)
         return found + [self._of_source(t, start, weights, source, total) for source, total in sources]
 
-    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str, total: Any) -> Any:
+    def _of_source(
+        self, t: Target, start: ExpansionStart, weights: dict[str, Any], source: str, total: Any
+    ) -> Any:
         for name, bar in weights.items():
             slope = self.record.tangents[name].get(source, 0.0)
             if slope != 0.0:
@@ -220,7 +231,7 @@ class Backward(Series):
                 self._add(t, self._bars[factor.slot], t.plus(k, -factor.back), t.number(1.0), total)
         return found
 
-    def _solve_back(self, t: Target, start: Start, h: Any, k: Any, found: dict[Factor, Any]) -> list:
+    def _solve_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, found: dict[Factor, Any]) -> list:
         """Go back through M_0 a_k = r and v_{k+1} = h a_k/(k+1); return the cotangents of r."""
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
@@ -239,7 +250,7 @@ class Backward(Series):
             t.store(*cell, t.sub(t.load(*cell), less))
         return right
 
-    def _one_order_back(self, t: Target, start: Start, h: Any, k: Any, order: Any) -> None:
+    def _one_order_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, order: Any) -> None:
         """Take the cotangents of all coefficients of order k > 0 to those of lower ones."""
         record, first = self.record, t.index(0)
         found = self._gather(t, k, order)
@@ -280,7 +291,9 @@ class Backward(Series):
             elif n in self._pairs:
                 t.store(self._sums[n], k, t.number(0.0))
 
-    def _node_back(self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable) -> None:
+    def _node_back(
+        self, t: Target, start: ExpansionStart, n: int, bar: Any, h: Any, k: Any, add: Callable
+    ) -> None:
         """Take a node's cotangent of order k to what it was made of, and to its sum of products."""
         node, zero = self.record.nodes[n], start.zero
         op, args = node.op, node.args
@@ -329,7 +342,9 @@ class Backward(Series):
 
     # --- order 0 -------------------------------------------------------------------------------------------
 
-    def _first_order_back(self, t: Target, start: Start, h: Any, order: Any) -> tuple[list, dict[str, Any]]:
+    def _first_order_back(
+        self, t: Target, start: ExpansionStart, h: Any, order: Any
+    ) -> tuple[list, dict[str, Any]]:
         """Return cotangents of places and velocities (None: zero), and of the active weights."""
         record, zero, first, n = self.record, start.zero, t.index(0), self.size
         gathered = self._gather(t, first, order, first=True)

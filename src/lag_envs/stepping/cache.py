@@ -37,7 +37,7 @@ class Damaged(Exception):
     """A file whose content is not what was written."""
 
 
-class Entry(NamedTuple):
+class CacheFile(NamedTuple):
     """A file of the cache: its path, its size in bytes, and when it was used last (to a day)."""
 
     path: Path
@@ -65,7 +65,7 @@ def folder() -> Path | None:
         return None
 
 
-def entries(place: Path) -> list[Entry]:
+def entries(place: Path) -> list[CacheFile]:
     """Return the files in a cache's folder, most recently used first, with leftovers of killed processes."""
     found = []
     with contextlib.suppress(OSError):
@@ -73,7 +73,7 @@ def entries(place: Path) -> list[Entry]:
             if item.name.endswith(_SUFFIX):
                 with contextlib.suppress(OSError):
                     status = item.stat(follow_symlinks=False)
-                    found.append(Entry(Path(item.path), status.st_size, status.st_mtime))
+                    found.append(CacheFile(Path(item.path), status.st_size, status.st_mtime))
     return sorted(found, key=lambda entry: entry.used, reverse=True)
 
 
@@ -138,11 +138,11 @@ def jit(function: Callable, key: str | None = None, inner: bool = False) -> Any:
             known = ((name, function.__globals__.get(name)) for name in function.__code__.co_names)
             key = repr((source, [(name, value) for name, value in known if isinstance(value, int | float)]))
     if key is not None and not numba.config.DISABLE_JIT:
-        dispatcher._cache = _Cache(function.__name__, key)
+        dispatcher._cache = _DispatcherCache(function.__name__, key)
     return dispatcher
 
 
-class _Cache:
+class _DispatcherCache:
     """A cache that a Numba dispatcher asks before it compiles, and tells after; see numba.core.caching."""
 
     def __init__(self, name: str, key: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import Layout, compile_attempt, compile_pull, compile_tangent
+from lag_envs.stepping.machine import LaneLayout, compile_attempt, compile_pull, compile_tangent
 from lag_envs.stepping.series import TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
@@ -26,7 +26,7 @@ SMALLEST_PART = 1e-9
 
 
 def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
-    """Take one control step of the lane in `rows`, see `Layout`; return the attempts, negative where refused.
+    """Take one control step of the lane in `rows` (`LaneLayout`); return the attempts, negative if refused.
 
     Inputs, places and velocities are read; places and velocities are replaced.
     """
@@ -43,7 +43,7 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
 def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
-    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds; behind them is
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `LaneLayout`, without bounds; behind them is
     room for as many rows and one more. A lane whose status is negative to begin with is left alone.
     Afterwards it is the number of attempts, negative where a lane was refused.
     """
@@ -93,7 +93,7 @@ def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
 
 
 def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, Any]:
-    layout = Layout(record)
+    layout = LaneLayout(record)
     return {
         "n": record.size,
         "q": layout.q,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.adjoint import Differentiable, Lanes
+from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.compiling import compile_function, count_operations, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.tracing import Trace
@@ -355,7 +355,7 @@ class Stepper:
         return [a + b for a, b in zip(direct, found, strict=True)], within
 
     @cache  # noqa: B019
-    def vjp(self, constants: tuple[str, ...] = ()) -> Lanes:
+    def vjp(self, constants: tuple[str, ...] = ()) -> LaneFormula:
         """Return the reverse mode of ordinary steps, compiled for lanes.
 
         Its inputs are the numbers dt, x and constants; states, controls, and cotangents of the states after
@@ -374,7 +374,7 @@ class Stepper:
             return [*split(found, len(state) + len(u)), [xp.where(within, 1.0, 0.0)]]
 
         absent = set(self._names) - set(self.constants)
-        return Lanes("vjp", vjp, [y, self.controls, seeds], ["dt", "x", *self._names], absent)
+        return LaneFormula("vjp", vjp, [y, self.controls, seeds], ["dt", "x", *self._names], absent)
 
     @cached_property
     def simulation(self) -> Callable:

@@ -520,9 +520,9 @@ class StepCode:
     @property
     def scratch(self) -> int:
         """Numbers that `compile` needs in its array of rows."""
-        from lag_envs.stepping.machine import Layout
+        from lag_envs.stepping.machine import LaneLayout
 
-        return Layout(self.record).rows
+        return LaneLayout(self.record).rows
 
     @property
     def arguments(self) -> str:

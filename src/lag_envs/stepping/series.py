@@ -134,7 +134,7 @@ class Factor(NamedTuple):
         return t.load(self.slot, t.plus(k, -self.back))
 
 
-class Start(NamedTuple):
+class ExpansionStart(NamedTuple):
     """What an expansion knows beside its slots: coefficients of order 0, the inverse of M_0, weights."""
 
     zero: dict[int, Any]
@@ -142,7 +142,7 @@ class Start(NamedTuple):
     scalars: dict[str, Any]
 
 
-class Lane(NamedTuple):
+class StepProgress(NamedTuple):
     """A control step on its way.
 
     Attributes
@@ -241,7 +241,7 @@ class Series:
 
     def expand(
         self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any
-    ) -> Start:
+    ) -> ExpansionStart:
         """Fill the slots with coefficients: velocities up to the order N, the rest below N.
 
         Parameters
@@ -274,7 +274,7 @@ class Series:
             t.store(self._slots["v", i], t.index(0), v[i])
         matrix = {place: self._entry(t, known, scalars, *entry) for place, entry in record.mass.items()}
         inverse = Inverse(t, matrix, self.size)
-        start = Start(known, inverse, scalars)
+        start = ExpansionStart(known, inverse, scalars)
         right = [known[f] if f >= 0 else None for f in record.force]
         rates = self._accelerate(t, inverse, right, h, t.index(0))
 
@@ -428,7 +428,7 @@ class Series:
         return t.fma(a.load(t, k), b.load(t, t.index(1)), total)
 
     def _one_order(
-        self, t: Target, start: Start, halves: dict, rates: list, h: Any, k: Any, inner_of: Callable
+        self, t: Target, start: ExpansionStart, halves: dict, rates: list, h: Any, k: Any, inner_of: Callable
     ) -> list:
         """Compute the coefficients of order k > 0, with sums from `_convolve`."""
         record = self.record
@@ -567,7 +567,7 @@ class Series:
         return self._certified(t, start, q, h, order, tolerance, wanted)
 
     def _certified(
-        self, t: Target, start: Start, q: Sequence, h: Any, order: Any, tolerance: Any, wanted: Any
+        self, t: Target, start: ExpansionStart, q: Sequence, h: Any, order: Any, tolerance: Any, wanted: Any
     ) -> tuple[Any, Any, list, list, list]:
         """Do what `attempt` does, after the expansion."""
         certificate = Certificate(self, t, start, h, order, tolerance)
@@ -616,8 +616,8 @@ class Series:
         return h
 
     def substep(
-        self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any, order: Any, tolerance: Any
-    ) -> tuple[Lane, list]:
+        self, t: Target, inputs: dict[str, Any], lane: StepProgress, dt: Any, order: Any, tolerance: Any
+    ) -> tuple[StepProgress, list]:
         """Go on with a control step dt of which something is left, by what one expansion gives.
 
         Returns
@@ -632,7 +632,9 @@ class Series:
         found = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
         return self._after(t, lane, order, wanted, *found)
 
-    def _before(self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any) -> tuple[dict[str, Any], Any]:
+    def _before(
+        self, t: Target, inputs: dict[str, Any], lane: StepProgress, dt: Any
+    ) -> tuple[dict[str, Any], Any]:
         """Return a substep's inputs and its length."""
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
@@ -641,7 +643,7 @@ class Series:
     def _after(
         self,
         t: Target,
-        lane: Lane,
+        lane: StepProgress,
         order: Any,
         wanted: Any,
         done: Any,
@@ -649,7 +651,7 @@ class Series:
         q: Sequence,
         v: Sequence,
         bounds: Sequence,
-    ) -> tuple[Lane, list]:
+    ) -> tuple[StepProgress, list]:
         """Return what `substep` does, from what `attempt` found."""
         zero = t.number(0.0)
         done = t.both(done, wanted)
@@ -657,7 +659,7 @@ class Series:
         left = t.sub(lane.left, used)
         # What is nearly a step more is taken as one.
         longer = t.select(t.less(left, t.mul(t.number(3.0), used)), left, t.add(used, used))
-        after = Lane(
+        after = StepProgress(
             [t.select(done, x, before) for x, before in zip(q, lane.q, strict=True)],
             [t.select(done, x, before) for x, before in zip(v, lane.v, strict=True)],
             t.add(lane.status, t.select(wanted, t.number(1.0), zero)),
@@ -755,7 +757,9 @@ class Certificate:
     its own series what is below k only.
     """
 
-    def __init__(self, series: Series, t: Target, start: Start, h: Any, order: Any, tolerance: Any) -> None:
+    def __init__(
+        self, series: Series, t: Target, start: ExpansionStart, h: Any, order: Any, tolerance: Any
+    ) -> None:
         self._series, self._t, self._order, self._tolerance = series, t, order, tolerance
         self._start, self._n, self._whole = start, series.size, h
         self._inverse = [[None if x is None else t.abs(x) for x in row] for row in start.inverse.rows]

@@ -533,7 +533,7 @@ class Acting:
     values: tuple[float, ...] = ()
 
 
-class _Recording(NamedTuple):
+class _RecordedStep(NamedTuple):
     """The parts of a step that a task can access while its formulas are recorded."""
 
     k: Any
@@ -687,7 +687,7 @@ class TaskFormulas:
         names = parameter_names(self._task.scene)
         task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
         task.dt = k.dt
-        task._recording = _Recording(
+        task._recording = _RecordedStep(
             k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
         )
         return task

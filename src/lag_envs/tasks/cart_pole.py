@@ -52,14 +52,14 @@ class _OnTrack(Task):
 
     def check_start(self, state: Any) -> None:
         """Refuse a start from which the episode would be over."""
-        if self.terminated(state, None, _Numbers):
+        if self.terminated(state, None, _NumberFunctions):
             raise ValueError(
                 f"the start must lie inside the limits at which an episode ends, got x={state.x:g} m, "
                 f"theta={state.theta:g} rad"
             )
 
 
-class _Numbers:
+class _NumberFunctions:
     """What `terminated` needs of a namespace, for numbers."""
 
     abs = staticmethod(abs)

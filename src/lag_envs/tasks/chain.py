@@ -15,7 +15,7 @@ from lag_envs.tasks.record import Controller, Examples, Goal, Open, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 
-class _Chain(Support):
+class _ChainTask(Support):
     """What the tasks with chains share."""
 
     scene: Any
@@ -63,7 +63,7 @@ class _Chain(Support):
         return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
 
 
-class SwingUp(GuardedTrack, _Chain):
+class SwingUp(GuardedTrack, _ChainTask):
     """Swing a double pendulum up by moving its support, and hold it upright.
 
     ## Description
@@ -451,7 +451,7 @@ alone works only if the bars happen to pass upright slowly.
         return self.push(draws, xp)
 
 
-class Balance(_Chain):
+class Balance(_ChainTask):
     """Keep a double pendulum upright against kicks by moving its support.
 
     ## Description

@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.envs.imperfect.twice import Functions, Twice, rounded
+from lag_envs.envs.imperfect.twice import Twice, TwiceFunctions, rounded
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import formula as naming
 from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values, twin
@@ -15,7 +15,7 @@ from lag_envs.stepping.compiling import record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.lag import lagged_stepper
-from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.tasks.base import Task
 
 
@@ -37,11 +37,11 @@ class DerivedConstants:
         for d in self._draws:
             inner[d.name] = trace.inputs(d.name)[0]
         self._follow(inner)
-        parameters = {n for n, x in inner.items() if isinstance(x, Number)}
+        parameters = {n for n, x in inner.items() if isinstance(x, TracedNumber)}
         found = self._task.formulas.starts_of(inner) | {f"self_{n}": x for n, x in inner.items()}
         found |= {n: x for n, x in self._motion(trace, inner, parameters).items() if n not in absent}
         #: Constants that change from episode to episode.
-        self.changed = [name for name, x in found.items() if isinstance(x, Number)]
+        self.changed = [name for name, x in found.items() if isinstance(x, TracedNumber)]
         self._parameters = parameters
 
     def _follow(self, numbers: dict[str, Any]) -> None:
@@ -59,11 +59,11 @@ class DerivedConstants:
         lagged = lagged_stepper(scene.mechanics).expressions() if self._lags else {}
         lagged = {f"lagged_{n}": e for n, e in lagged.items() if changed & {s.name for s in e.symbols()}}
         values = {
-            parameter(name): Twice(x) if isinstance(x, Number) else Fraction(x)
+            parameter(name): Twice(x) if isinstance(x, TracedNumber) else Fraction(x)
             for name, x in numbers.items()
-            if isinstance(x, Number) or math.isfinite(x)
+            if isinstance(x, TracedNumber) or math.isfinite(x)
         }
-        functions = Functions(trace)
+        functions = TwiceFunctions(trace)
         found = evaluate(list(wanted.values()), values, functions)
         if form:
             (inertia,) = evaluate([form.inertia], values, functions)

@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.stepping.twofold import two_product, two_sum
 
 
@@ -49,7 +49,7 @@ class Twice:
 def _twice(value: Any) -> Twice:
     if isinstance(value, Twice):
         return value
-    if isinstance(value, Number):
+    if isinstance(value, TracedNumber):
         return Twice(value)
     exact = Fraction(value)
     return Twice(float(exact), float(exact - Fraction(float(exact))))
@@ -60,7 +60,7 @@ def rounded(value: Any) -> Any:
     return value.high + value.low if isinstance(value, Twice) else float(value)
 
 
-class Functions:
+class TwiceFunctions:
     """Functions of numbers with twice the digits, evaluated at the nearest floats."""
 
     Rational, mpf, pi = Fraction, None, Fraction(math.pi)

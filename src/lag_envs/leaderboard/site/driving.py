@@ -14,11 +14,11 @@ import numpy as np
 from lag_envs.controllers.basic import FeedbackLaw
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.architecture import Array, Head
-from lag_envs.leaderboard.grids import Table
+from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, Linear, Network
-from lag_envs.leaderboard.policies import Controller, Policy
+from lag_envs.leaderboard.policies import ControllerPolicy, SubmittedPolicy
 from lag_envs.leaderboard.site.scenery import picture
-from lag_envs.leaderboard.tracking import Plan
+from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.replay import LEVELS, VERSION
@@ -195,7 +195,7 @@ def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
 # --- agents -------------------------------------------------------------------------------------------------
 
 
-def agent(policy: Policy) -> dict[str, Any] | None:
+def agent(policy: SubmittedPolicy) -> dict[str, Any] | None:
     """Return a policy as the page runs it, in JSON types; None for one that only Python can run.
 
     The page runs networks, linear and time-varying feedback, and tables; of the controllers, only those that
@@ -207,11 +207,11 @@ def agent(policy: Policy) -> dict[str, Any] | None:
         The policy.
     """
     made = policy.architecture
-    if isinstance(made, Table) and made.task.imperfections:
+    if isinstance(made, GridArchitecture) and made.task.imperfections:
         return None  # it looks ahead on the environment without imperfections, which the page does not have
-    if isinstance(made, Network | Linear | Table):
+    if isinstance(made, Network | Linear | GridArchitecture):
         about, arrays, head = _learned(policy), policy.arrays, made.head
-    elif isinstance(made, Plan | Controller) and not made.plans:
+    elif isinstance(made, PlanArchitecture | ControllerPolicy) and not made.plans:
         acting = policy.agent()
         law = acting.law(made.task) if hasattr(acting, "law") else None
         if law is None:
@@ -226,12 +226,12 @@ def agent(policy: Policy) -> dict[str, Any] | None:
     }
 
 
-def _learned(policy: Policy) -> dict[str, Any]:
+def _learned(policy: SubmittedPolicy) -> dict[str, Any]:
     """Return the page's data about a policy whose arrays it uses as they are."""
     made: Any = policy.architecture
     if isinstance(made, Linear):
         return {"kind": "linear"}
-    if isinstance(made, Table):
+    if isinstance(made, GridArchitecture):
         return {
             "kind": f"{made.kind} table",
             "sums": made.sums.tolist(),
