@@ -1,8 +1,8 @@
 """Cloning a controller in one file: a network learns the controller's action in every state that it reaches.
 
 It needs no reward, and is at best as good as its expert. In each iteration the network acts, the controller
-labels the states (`CloningLearner.collect`), and the network learns by regression from all data collected
-so far (`CloningLearner.update`). The algorithm is DAgger [1]_.
+labels the states (`Learner.collect`), and the network learns by regression from all data collected so far
+(`Learner.update`). The algorithm is DAgger [1]_.
 
 References
 ----------
@@ -32,7 +32,7 @@ NAME = "cloning"  #: see `agents.learners.OWN`
 Array = NDArray[np.float32]
 
 
-class CloningSettings(LearnerSettings):
+class Settings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -48,7 +48,7 @@ class CloningSettings(LearnerSettings):
     first_layer_scale: float = Field(gt=0, description="factor of the first layer's weights at the start")
 
 
-class CloningLearner:
+class Learner:
     """Environments, controller, network and optimiser.
 
     Parameters
@@ -68,7 +68,7 @@ class CloningLearner:
         For an environment whose actions are choices, and for one without such a controller.
     """
 
-    def __init__(self, env_id: str, settings: CloningSettings, seed: int, steps: int) -> None:
+    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the network is too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0

@@ -31,7 +31,7 @@ from agents.run import (
 from lag_envs import TASKS, __version__, controllers, store
 from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
 from lag_envs.evaluation.rollout import Meter, Rollout, RolloutStep, observation_std
-from lag_envs.evaluation.statistics import rounded
+from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard import export
 from lag_envs.leaderboard.export import exported, find
 
@@ -114,7 +114,7 @@ def _policy(env_id: str, folder: Path) -> Any:
     return exported(source, env_id).agent
 
 
-def learned(env_id: str, folder: Path) -> Entrant:
+def learned_policy(env_id: str, folder: Path) -> Entrant:
     """Return the policy of a finished run, or raise a UserError."""
     result = read_result(folder / RESULT)
     own = env_id, folder.parent.name, folder.name.removeprefix("seed")
@@ -229,7 +229,7 @@ class Evaluation:
         first: dict[str, Entrant] = {}
         for folder in sorted(folders, key=lambda p: (p.parent.name, len(p.name), p.name)):
             try:
-                entrant = learned(self.env, folder)
+                entrant = learned_policy(self.env, folder)
                 check_alike(entrant, first.setdefault(entrant.name, entrant))
             except UserError as error:
                 self.broken.append(str(error))
@@ -273,7 +273,7 @@ class Evaluation:
     def keep(self, job: MeasurementJob, returns: NDArray) -> None:
         """Store a measurement."""
         about = {"key": job.key, "agent": str(job.entrant), "condition": job.condition.name}
-        row = about | {"returns": rounded(returns.tolist())}
+        row = about | {"returns": rounded_data(returns.tolist())}
         store.append(self.file, row)
         self.returns[job.key] = row["returns"]
 
@@ -313,7 +313,7 @@ def _where(run: Data) -> str:
     return f"{run.get('machine', 'unknown machine')}: {found}"
 
 
-def measure(todo: Sequence[tuple[Evaluation, MeasurementJob]]) -> None:
+def measure_policies(todo: Sequence[tuple[Evaluation, MeasurementJob]]) -> None:
     """Measure, policy by policy, and show the progress."""
     from tqdm import tqdm
 

@@ -1,8 +1,8 @@
 """Proximal policy optimisation in one file of plain PyTorch: read it from top to bottom.
 
 ``python -m agents.ppo --help`` has the options. An iteration lets the policy act in all environments
-(`PPOLearner.collect`), estimates how much better each action was than expected (`PPOLearner.advantages`), and
-makes better actions more likely, within limits (`PPOLearner.update`). The algorithm is that of [1]_, with the
+(`Learner.collect`), estimates how much better each action was than expected (`Learner.advantages`), and
+makes better actions more likely, within limits (`Learner.update`). The algorithm is that of [1]_, with the
 estimator of [2]_ and the exploration of [3]_.
 
 References
@@ -35,10 +35,10 @@ from torch import Tensor, nn
 import agents
 from agents.learners import LearnerSettings, trainable
 from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
-from agents.train import command, follow, here, plan, summarise
+from agents.train import command, here, planned_runs, print_returns, show_progress
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 NAME = "fast_ppo"  #: see `agents.learners.OWN`
 Array = NDArray[np.float32]
@@ -47,7 +47,7 @@ Array = NDArray[np.float32]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-class PPOSettings(LearnerSettings):
+class Settings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -156,7 +156,7 @@ class ActingPolicy:
         arrays = {name: array for layer in layers for name, array in layer.items()}
         arrays |= {"choices": np.array(self.choices, np.int64), "largest": np.array(self.largest)}
         np.savez(file, allow_pickle=False, **arrays)
-        write(path, file.getvalue())
+        write_file(path, file.getvalue())
 
     @classmethod
     def load(cls, path: Path) -> ActingPolicy:
@@ -175,7 +175,7 @@ class GaussianActor:
     state. The environment clips actions beyond the action space.
     """
 
-    def __init__(self, settings: PPOSettings, actions: int) -> None:
+    def __init__(self, settings: Settings, actions: int) -> None:
         self.by_state, self.steps = settings.state_noise, settings.noise_steps
         shape = settings.actor[-1] if self.by_state else 1, actions
         self.log_std = nn.Parameter(torch.full(shape, float(settings.log_std_init)))
@@ -231,7 +231,7 @@ class Experience(NamedTuple):
     final: Array  #: (T, n, n_observation); last observations of episodes, at the steps at which they end
 
 
-class PPOLearner:
+class Learner:
     """Environments, networks and optimiser.
 
     Parameters
@@ -246,7 +246,7 @@ class PPOLearner:
         Steps to train for; with them the learning rate is 0.
     """
 
-    def __init__(self, env_id: str, settings: PPOSettings, seed: int, steps: int) -> None:
+    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
@@ -389,7 +389,7 @@ examples:
 """
 
 #: Settings that are command-line options; n_timesteps is --steps.
-OPTIONS = [name for name in PPOSettings.model_fields if name != "n_timesteps"]
+OPTIONS = [name for name in Settings.model_fields if name != "n_timesteps"]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -408,8 +408,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
     group = p.add_argument_group("settings, of which each task has its own")
     for name in OPTIONS:
-        field = PPOSettings.model_fields[name]
-        kind: Any = {float: float, bool: truth}.get(field.annotation, int)
+        field = Settings.model_fields[name]
+        kind: Any = {float: float, bool: yes_or_no}.get(field.annotation, int)
         many: Any = {"nargs": "+"} if field.annotation == list[PositiveInt] else {}
         group.add_argument(
             "--" + name.replace("_", "-"), type=kind, metavar="X", help=field.description, **many
@@ -417,7 +417,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def truth(text: str) -> bool:
+def yes_or_no(text: str) -> bool:
     """Return the value of yes or no."""
     if text not in ("yes", "no"):
         raise argparse.ArgumentTypeError(f"must be yes or no, got {text!r}")
@@ -430,12 +430,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     given = {name: getattr(args, name) for name in OPTIONS}
     changed = {name: value for name, value in given.items() if value is not None}
-    runs = plan(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
+    runs = planned_runs(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
-        PPOSettings.of(run.hyperparameters)  # fail now, not after another seed has been trained
+        Settings.of(run.hyperparameters)  # fail now, not after another seed has been trained
     todo = [run for run in runs if run.load_result() is None]
-    failed, stopped = follow(todo, here) if todo else ({}, False)
-    summarise([run for run in runs if run.name not in failed])
+    failed, stopped = show_progress(todo, here) if todo else ({}, False)
+    print_returns([run for run in runs if run.name not in failed])
     for name, reason in failed.items():
         print(f"{name} failed: {reason}", file=sys.stderr)
     if stopped or failed:

@@ -1,12 +1,12 @@
 """Short-horizon actor-critic in one file: a policy improved by the exact gradient of its return.
 
 The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing has to be tried out. In
-each iteration the policy acts for a window of some steps (`SHACLearner.collect`), the derivatives of all
-later rewards in the window with respect to each action are computed (`SHACLearner.gradients`), and the policy
-follows the gradient (`SHACLearner.update`). A critic estimates the rewards after the window. The algorithm is
-that of [1]_, with one addition: at each step, derivatives larger than `max_slope` are scaled back to it.
-Without a critic, and with windows as long as episodes, it is back-propagation through time, also called
-analytic policy gradients.
+each iteration the policy acts for a window of some steps (`Learner.collect`), the derivatives of all later
+rewards in the window with respect to each action are computed (`Learner.gradients`), and the policy follows
+the gradient (`Learner.update`). A critic estimates the rewards after the window. The algorithm is that of
+[1]_, with one addition: at each step, derivatives larger than `max_slope` are scaled back to it. Without a
+critic, and with windows as long as episodes, it is back-propagation through time, also called analytic policy
+gradients.
 
 For PyTorch a window is one batch. The derivatives of all its steps are computed at once, because the states
 are known by then; the backward pass is only a recursion of small matrices in NumPy.
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-class SHACSettings(LearnerSettings):
+class Settings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -89,7 +89,7 @@ class ExperienceWindow(NamedTuple):
     over: NDArray[np.bool_]  #: (T, n)
 
 
-class SHACLearner:
+class Learner:
     """Environments, networks and optimisers.
 
     Parameters
@@ -109,7 +109,7 @@ class SHACLearner:
         For an environment without derivatives, and for start ranges of unknown states.
     """
 
-    def __init__(self, env_id: str, settings: SHACSettings, seed: int, steps: int) -> None:
+    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.stepping.cache import jit
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 Array = NDArray[np.float64]
 #: (points (n, d), actions (n,)) to (coordinates (n, d), rewards (n,), ended (n,)).
@@ -169,7 +169,7 @@ def interpolate_rows(values: Any, times: Any, cells: Any, places: Any, strides: 
 
 
 @jit
-def carried(x: Any, nodes: Any, own: Any, others: Any) -> Any:
+def regridded(x: Any, nodes: Any, own: Any, others: Any) -> Any:
     """Carry each x from its own axis, ``nodes[own[i]]``, to the same place among the nodes `others`."""
     out = np.empty(len(x))
     for i in range(len(x)):
@@ -462,4 +462,4 @@ class ValueCache:
             "parameters": self.parameters, "done": done, "seconds": round(seconds, 3),
             "check": zlib.crc32(self.values[done]),
         }  # fmt: skip
-        write(self.folder / PROGRESS, json.dumps(progress, indent=1) + "\n")
+        write_file(self.folder / PROGRESS, json.dumps(progress, indent=1) + "\n")

@@ -25,7 +25,7 @@ def scene_of(name, params):
 
 def flow(scene_name, params, state, control, dt, dps=40):
     """Return the state after one step with the control held, with dps - 10 digits at least."""
-    return reference.flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
+    return reference.exact_flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
 
 
 def moving_plane(k, beta, gravity, radius, tilt_rate, state, dt):

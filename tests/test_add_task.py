@@ -18,21 +18,21 @@ from toy_pendulum import Pendulum, Swing
 
 from agents import behaviour, results, scale, submit, train
 from agents.learners import load_policy
-from agents.report import page
+from agents.report import agents_page
 from lag_envs import TASKS, cli, register
 from lag_envs.controllers import controllers, make_controller
 from lag_envs.controllers.basic import ObservationDecoder
-from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.pending import finish
-from lag_envs.leaderboard.site.build import build
+from lag_envs.leaderboard.site.build import write_page
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import load
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.scores import known_returns
-from lag_envs.tasks import find, measured
+from lag_envs.tasks import find_tasks, measured
 from tools.docs import environments
 
 ROOT = Path(__file__).parents[1]
@@ -55,7 +55,7 @@ def file(tmp_path_factory):
 @pytest.fixture
 def task(file, tmp_path, monkeypatch):
     """Find the file's task like those of the package, and return its class."""
-    places = find(file.parent, "")
+    places = find_tasks(file.parent, "")
     assert places == {ID: "two_link_arm:Reach"}
     monkeypatch.syspath_prepend(str(file.parent))
     monkeypatch.setitem(TASKS.data, ID, places[ID])
@@ -122,7 +122,7 @@ def test_commands(task, file, capsys):
 
 def test_docs_page(task):
     """Its page, though it has neither prose nor results yet."""
-    page = environments.page(ID)
+    page = environments.environment_page(ID)
     headings = re.findall("^## (.+)$", page, re.MULTILINE)
     assert headings == [name for name in environments.HEADINGS if name in headings]
     assert {"Action Space", "Observation Space", "Arguments", "Equations"} <= set(headings)
@@ -154,13 +154,15 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     data = results.load_summary(output, needed=True)
     assert set(data["envs"][ID]["agents"]) == {"zero", "random", "springs", "fast_ppo"}
     text = (output / "docs" / "agents.md").read_text(encoding="utf-8")
-    assert text == page(data) and f"## {ID}" in text and task.note in text and "springs, the best" in text
-    found = behaviour.measures(record(Rollout(ID, make_controller(ID, "springs"), range(20))))
+    assert (
+        text == agents_page(data) and f"## {ID}" in text and task.note in text and "springs, the best" in text
+    )
+    found = behaviour.measures(record_rollout(Rollout(ID, make_controller(ID, "springs"), range(20))))
     assert found["there after [s]"] < 1.5 and found["episodes without"] < 10
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 2)
-    submit.learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
+    submit.submit_learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
     for name in controllers(task):
         submit.controller(ID, name, tmp_path / name)
     board = Board(tmp_path / "board")
@@ -180,7 +182,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     assert [finding.wrong for finding in findings if finding.wrong] == []
 
     # Its page, and its entries in README and docs.
-    build(data | {"environments": [shown]}, tmp_path / "site")
+    write_page(data | {"environments": [shown]}, tmp_path / "site")
     assert "springs" in (tmp_path / "site" / f"{ID}.html").read_text(encoding="utf-8")
     assert f"| {ID} | Success: both joints" in docs.goals()
 

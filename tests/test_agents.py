@@ -20,7 +20,7 @@ from lag_envs.evaluation.rollout import play
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 from tools.missing import have
 
 ROOT = Path(__file__).parents[1]
@@ -219,7 +219,7 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "ADAPTER", tmp_path / "adapter.json")
     assert bench.main(["--rounds", "1", "--output", str(report.ADAPTER)]) == 0
     assert "DummyVecEnv" in capsys.readouterr().out
-    assert "| step | 2 | " in report.adapter() and "| PPO | 16 | " in report.adapter()
+    assert "| step | 2 | " in report.adapter_rates() and "| PPO | 16 | " in report.adapter_rates()
     assert bench.main(["--rounds", "0"]) == 2
 
 
@@ -263,7 +263,7 @@ def test_scale_plans_in_few_episodes(monkeypatch, capsys, tmp_path):
 
 def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
     """The best seed of each plays; the best known one keeps its numbers if it no longer exists."""
-    env_id, runs, before = incline.Brake.id, tmp_path / "runs", measured(incline.Brake.id)
+    env_id, runs, before = incline.Brake.id, tmp_path / "runs", measured_entry(incline.Brake.id)
     for seed, (push, mean) in enumerate([(-1.0, -12.0), (1.0, -2.0), (0.5, -3.0)]):
         folder = runs / env_id / "fast_ppo" / f"seed{seed}"
         folder.mkdir(parents=True)
@@ -272,13 +272,13 @@ def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
         result = {"schema": 1, "env": env_id, "algo": "fast_ppo", "seed": seed, "trained": 1, "steps": 1}
         result |= {"wall_seconds": 1.0, "mean_return": mean, "score": 0.0, "curve": [], "hyperparameters": {}}
         (folder / "result.json").write_text(json.dumps(result | {"evaluation": {"returns": []}}))
-    new = scale.measured(env_id, 1, True, {}, 100, runs=runs)
+    new = scale.measure_environment(env_id, 1, True, {}, 100, runs=runs)
     constant = make_controller(env_id, "full damping")
     expected = play(env_id, constant, range(scale.FIRST_SEED, scale.FIRST_SEED + 100)).mean()
     assert new["measured"]["fast PPO"]["mean"] == pytest.approx(expected, abs=1e-6)
     assert new["scale"]["policy"] == before["scale"]["policy"]
     best = before | {"scale": new["scale"] | {"policy": "fast PPO"}, "measured": new["measured"]}
     capsys.readouterr()
-    gone = scale.measured(env_id, 1, True, best, 100, runs=tmp_path / "none")
+    gone = scale.measure_environment(env_id, 1, True, best, 100, runs=tmp_path / "none")
     assert gone["measured"]["fast PPO"] == new["measured"]["fast PPO"]
     assert "fast PPO             is not in" in capsys.readouterr().out

@@ -25,15 +25,15 @@ from lag_envs.leaderboard.standings import board_data
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report.docs import generated
 from lag_envs.report.environment_results import LARGEST_STEP
-from lag_envs.report.episodes import play, random_actions
-from lag_envs.report.reference import flow
+from lag_envs.report.episodes import endless_actions, record_episode
+from lag_envs.report.reference import exact_flow
 from lag_envs.report.report import SECTIONS
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, order_of
 from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, pivoted_bar
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
 from tools.docs.equations import symbol
@@ -229,7 +229,7 @@ def test_equations(env_id, page):
 @pytest.mark.parametrize("env_id", covering(have("returns")))
 def test_known_returns_and_agents(env_id, page, board):
     found = sections(page)
-    known = measured(env_id)["measured"]
+    known = measured_entry(env_id)["measured"]
     stated = {row["Policy"]: row for row in table(found["Known Returns"])}
     assert float(stated["random actions"]["Return"].split(" ")[0]) == pytest.approx(
         known["random"]["mean"], rel=1e-3
@@ -291,14 +291,14 @@ def test_measured_error(env_id):
     assert f"error is less than {limit} of the largest value that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
-    episode = play(env, random_actions(env, 3))
+    episode = record_episode(env, endless_actions(env, 3))
     sizes = np.maximum(1.0, np.abs(episode.states).max(axis=0))
     for i in np.linspace(0, len(episode.controls) - 1, 14).astype(int).tolist():
         before, control = episode.states[i], episode.controls[i]
         after = episode.states[i + 1]
         if env.task.draws:
             after = scene.simulate(before, [control], env.task.dt)[1]  # without a kick
-        exact = flow(scene, before, control, env.task.dt)
+        exact = exact_flow(scene, before, control, env.task.dt)
         errors = [abs(float(a - b)) / size for a, b, size in zip(exact, after, sizes, strict=True)]
         grown = np.abs(scene.jacobian(before, control, env.task.dt)[0]) * sizes / sizes[:, None]
         attempts = scene.step_bound(before, control, env.task.dt).substeps
@@ -308,7 +308,7 @@ def test_measured_error(env_id):
 
 def scale(env_id):
     """Return the results of `python -m agents.scale`, by policy."""
-    return measured(env_id)["measured"]
+    return measured_entry(env_id)["measured"]
 
 
 @pytest.mark.parametrize("env_id", have("returns"))
@@ -370,7 +370,7 @@ def test_a_replay_becomes_a_moving_picture(tmp_path):
     states = [[0.0, 0.0, 0.1 * i, 0.5] for i in range(13)]
     replay = {"states": states, "actions": [[0.5]] * 12, "target": None}
     frames, seconds = pictures.frames(env_id, replay)
-    pictures.write(tmp_path / "a.webp", frames, seconds)
+    pictures.write_animation(tmp_path / "a.webp", frames, seconds)
     with Image.open(tmp_path / "a.webp") as picture:
         assert picture.n_frames == len(frames) == 5 and picture.width == pictures.CHOICES[0][0]
 

@@ -20,7 +20,7 @@ from lag_envs import cli, replay
 from lag_envs.controllers import controllers
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
-from lag_envs.leaderboard.site.build import build
+from lag_envs.leaderboard.site.build import write_page
 from lag_envs.leaderboard.site.driving import agent, script_of, sliders
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum, pivoted_bar
 from tests import board_pages
@@ -80,7 +80,7 @@ def rollout(task, seed, actions, env=None):
 @pytest.fixture
 def alone(tmp_path, id):
     """A folder with the page of an environment, without agents."""
-    build(board_pages.data((id,), agents=()), tmp_path)
+    write_page(board_pages.data((id,), agents=()), tmp_path)
     return tmp_path
 
 
@@ -88,7 +88,7 @@ def alone(tmp_path, id):
 def bare(tmp_path_factory):
     """A folder with pages of environments, without agents, and the files that drive users' tasks."""
     folder = tmp_path_factory.mktemp("bare")
-    build(board_pages.data(BARE, agents=()), folder)
+    write_page(board_pages.data(BARE, agents=()), folder)
     for task in (*OWN, Six):
         (folder / "assets" / f"{task.id}.js").write_text(script_of(task))
     return folder
@@ -234,7 +234,7 @@ def link():
     keys, total, over = [], 0.0, False
     while not over:
         keys.append(((-64, 33, 64)[min(len(keys) // 9, 2)],))
-        _, reward, *ended = env.step(replay.action_of(keys[-1], task))
+        _, reward, *ended = env.step(replay.action_from_numbers(keys[-1], task))
         total, over = total + reward, any(ended)
     return replay.Drive(task.id, 77, replay.pack(keys), total, env.program.digest)
 
@@ -360,7 +360,7 @@ def owned(tmp_path_factory):
         for task in OWN:
             patch.setitem(TASKS, task.id, task)
         boards = [{"id": task.id, "rows": []} for task in OWN]
-        build({"protocol": 1, "made": "today", "environments": boards}, folder)
+        write_page({"protocol": 1, "made": "today", "environments": boards}, folder)
     return folder
 
 
@@ -582,7 +582,7 @@ def haunted(tmp_path_factory):
     for replay_ in recorded["replays"]:
         replay_["reset_seed"] = 2**61 + 3
     data["environments"][0]["drives"] = [{"name": "Ada", "link": "#seed=4", "return": 1.0, "score": 0.5}]
-    build(data, folder)
+    write_page(data, folder)
     return folder
 
 
@@ -617,7 +617,7 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
     if ghost:
         axes = {"axis_0": np.linspace(-1, 1, 9), "axis_1": np.linspace(-2, 2, 9), "table": np.ones((9, 9))}
         data["environments"][0]["rows"][0]["agent"] = agent(SubmittedPolicy(architecture(id, table), axes))
-    build(data, tmp_path)
+    write_page(data, tmp_path)
     assert any(np.quantile(frames(drive(id, folder=tmp_path), ghost), 0.95) <= 8.0 for _ in range(3))
 
 

@@ -727,7 +727,7 @@ def test_making_again_derives_nothing(env_id, monkeypatch):
         raise AssertionError("derived anew")
 
     monkeypatch.setattr("lag_envs.mechanics.motion.derive_motion", refuse)
-    monkeypatch.setattr("lag_envs.mechanics.recording.record", refuse)
+    monkeypatch.setattr("lag_envs.mechanics.recording.record_scene", refuse)
     monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._names", refuse)
     make(env_id, **others)
 

@@ -25,7 +25,7 @@ from agents.value_iteration import PROGRESS, VALUES, CacheError, DynamicProgramm
 from lag_envs.controllers import make_controller, optimal_return
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
-from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.incline import Brake
@@ -384,7 +384,7 @@ def test_killed_command_goes_on(tmp_path, number):
 @pytest.mark.slow
 def test_bar_is_up_in_two_seconds():
     agent = GreedyPolicy(pivoted_bar.SwingUpFree.id, level=2.0, folder=None)
-    played = record(Rollout(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(1)))
+    played = record_rollout(Rollout(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(1)))
     assert 1.5 < played.settled()[0] < 2.5  # up for good
     assert play(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(100)).mean() > 419.5
 
@@ -409,7 +409,7 @@ def test_committed_results_are_consistent(file):
         list(grid(problem, level, 0.0).shape) for level in problem.levels
     ]
     # The caches' names depend on nodes, step and reward: none is out of date.
-    assert result["parameters"] == pytest.approx(optimum.parameters(TASKS[source](**problem.options)))
+    assert result["parameters"] == pytest.approx(optimum.scene_numbers(TASKS[source](**problem.options)))
     assert problem.actions == result["actions"] and list(problem.targets) == result["targets"]
     if result["lower"] is not None:
         low, high = result["lower"]["interval"]

@@ -18,7 +18,7 @@ from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.kernels import affine
 from lag_envs.leaderboard.policies import ARCHITECTURES, SubmittedPolicy, architecture
 from lag_envs.leaderboard.submission import Refused, load, write
-from lag_envs.leaderboard.verify import replay, verify
+from lag_envs.leaderboard.verify import record_again, verify
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
 from lag_envs.tasks.record import Goal
@@ -224,7 +224,7 @@ def test_listed_actions_go_through_the_board(env, tmp_path):
     made = submission(tmp_path / "a", env, policy)
     result = verify(made, "nonce", 3)
     assert result["often"] and len(result["policies"][0]["returns"]) == 3
-    told, episodes = replay(made, result, 1, [2])
+    told, episodes = record_again(made, result, 1, [2])
     assert told["returns"] == result["policies"][1]["returns"][2:]
     sizes = TASKS[env]().formulas.choices
     actions = np.reshape(episodes[0]["actions"], (-1, len(sizes)))

@@ -13,7 +13,7 @@ from lag_envs.report.motions import CertifiedSeries, SceneEquation, SceneProblem
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
-from lag_envs.report.reference import ends
+from lag_envs.report.reference import exact_ends
 from lag_envs.report.rivals import CompiledMethod
 from lag_envs.scenes import Scene, parameter
 from lag_envs.scenes.derivation import order_of
@@ -49,14 +49,14 @@ def problem(name):
     """Return a system's problems and their exact ends."""
     system = SYSTEMS[name]
     starts, controls = system.draw(COUNT)
-    return SceneProblems(system.scene, starts, controls, system), ends(
+    return SceneProblems(system.scene, starts, controls, system), exact_ends(
         system.scene, starts, controls, general_results.DT
     )
 
 
 def worst(rival, name, together=False):
     problems, truth = problem(name)
-    return general.errors(rival.build(problems, general_results.DT, 1, together).end(), truth)[0]
+    return general.worst_and_median(rival.build(problems, general_results.DT, 1, together).end(), truth)[0]
 
 
 # --- the reference ---
@@ -68,14 +68,14 @@ def test_what_moves_a_support(control):
     scene = Trolley(control=control)
     states = np.random.default_rng(1).uniform(-2, 2, (4, len(scene.state_names)))
     controls = np.random.default_rng(2).uniform(-2, 2, (4, 1))
-    truth = ends(scene, states, controls, 0.05)
+    truth = exact_ends(scene, states, controls, 0.05)
     problems = SceneProblems(scene, states, controls)
     for rival in (
         CertifiedSeries(CertifiedSeries.method_of(18), 1e-14),
         CompiledMethod("DOP853", 8),
         CompiledRadau("Radau IIA", 200),
     ):
-        assert general.errors(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
+        assert general.worst_and_median(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
 
 
 # --- the rivals ---
@@ -164,7 +164,7 @@ ROWS = [
 
 
 def test_times_are_compared_at_equal_error_in_one_clock():
-    found = general_results.best(ROWS)
+    found = general_results.best_settings(ROWS)
     assert found["cart-pole", "single", 1e-3]["lag_envs"].ns == 50.0
     assert found["cart-pole", "single", 1e-6]["lag_envs"].ns == 80.0
     assert found["cart-pole", "single", 1e-6]["heyoka"].ns == 80.0  # its job ran at half the speed
@@ -188,7 +188,7 @@ def test_what_is_missing_is_said_and_no_error(monkeypatch):
     problems, truth = problem("cart-pole")
     clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
     rows = list(
-        general.measured(
+        general.timed_rivals(
             problems, truth, [Heyoka("Taylor", 1e-9)], clock, "single", 1, {"system": "cart-pole"}
         )
     )
@@ -198,6 +198,6 @@ def test_what_is_missing_is_said_and_no_error(monkeypatch):
 
 def test_certificates_of_a_scene():
     system = SYSTEMS["cart-pole"]
-    attempts, bounds = general.certified(system.scene, *system.draw(20), 0.02, 16)
+    attempts, bounds = general.attempts_and_bounds(system.scene, *system.draw(20), 0.02, 16)
     assert attempts == [1] * 20 and bounds.max() < 1e-12
     assert general.shares([1, 2, -5]) == {"share": 1 / 3, "attempts": 1.5, "refused": 1}

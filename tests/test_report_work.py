@@ -37,7 +37,7 @@ def single_steps():
 @cache
 def truths(name, count, steps=1):
     dt = work_precision.control_step(name)
-    return [work_precision.truth(case, dt, steps) for case in ensemble(name, count, seed=5)]
+    return [work_precision.exact_end(case, dt, steps) for case in ensemble(name, count, seed=5)]
 
 
 def worst(rival, name, together, steps=1, count=6):
@@ -91,7 +91,7 @@ def test_ours_is_what_simulate_does(name):
 def test_only_what_is_shipped_counts_as_ours(name, quick, monkeypatch):
     """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
-        found = work_precision.rivals(name, horizon, "compiled", quick)
+        found = work_precision.variant_rivals(name, horizon, "compiled", quick)
         assert {r.method for r in found if r.family == "ours"} <= {
             ShippedStepping.METHOD,
             ShippedStepping.ONE_CALL,
@@ -275,7 +275,7 @@ def _has(package):
 
 def test_a_missing_library_is_a_row(monkeypatch):
     monkeypatch.setitem(sys.modules, "heyoka", None)
-    rows = list(work_precision.points("PivotedBar", "heyoka", quick=True))
+    rows = list(work_precision.variant_points("PivotedBar", "heyoka", quick=True))
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
     table = next(t for t in work_precision.content(rows, []).tables if t.name.endswith("problems"))
     assert table.rows == [
@@ -286,7 +286,7 @@ def test_a_missing_library_is_a_row(monkeypatch):
 def test_what_takes_too_long_is_not_run(monkeypatch):
     monkeypatch.setattr(work_precision, "LIMIT", 0.0)
     monkeypatch.setattr(work_precision, "QUICK", {"one step": work_precision.QUICK["one step"]})
-    rows = list(work_precision.points("PivotedBar", "scipy", quick=True))
+    rows = list(work_precision.variant_points("PivotedBar", "scipy", quick=True))
     assert rows and all(row["problem"].startswith("not run, it would take") for row in rows)
     assert len({(row["mode"], row["method"]) for row in rows}) == len(rows)
 
@@ -500,7 +500,7 @@ def test_the_picture_has_the_fastest_form_of_each():
         ("RK4, carried", 20.0),
         ("RK4", 50.0),
     ]
-    figure = diagrams.draw("PivotedBar", points, {})
+    figure = diagrams.draw_variant("PivotedBar", points, {})
     assert len(figure.axes) == 2
     known = {*diagrams.STYLES, *diagrams.OURS}
     assert {

@@ -42,7 +42,7 @@ from lag_envs.stepping.series import (
     Series,
     StepProgress,
 )
-from lag_envs.stepping.tracing import evaluate
+from lag_envs.stepping.tracing import evaluate_operations
 
 NAMES = [system.name for system in SYSTEMS]
 FLOATS = types.SimpleNamespace(
@@ -401,7 +401,7 @@ def in_python(name, source, *helpers, **constants):
 
     def block(operations, inputs, outputs):
         def run(*values):
-            known = evaluate(operations, dict(zip(inputs, values, strict=True)))
+            known = evaluate_operations(operations, dict(zip(inputs, values, strict=True)))
             return tuple(known[name] for name in outputs)
 
         return run

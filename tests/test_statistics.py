@@ -21,7 +21,7 @@ from lag_envs.evaluation.statistics import (
     pooled_iqm,
     profile,
     redraw,
-    rounded,
+    rounded_data,
     wilson,
     without_luck,
 )
@@ -86,7 +86,7 @@ def test_estimate():
 
 
 def test_numbers_are_rounded_wherever_they_stand():
-    assert rounded({"a": [1.23456789, (2, None)], "b": True}) == {"a": [1.23457, [2, None]], "b": True}
+    assert rounded_data({"a": [1.23456789, (2, None)], "b": True}) == {"a": [1.23457, [2, None]], "b": True}
 
 
 # --- luck ---

@@ -19,7 +19,7 @@ def go(run, until=10**9):
             raise KeyboardInterrupt
 
     try:
-        learners.train(run, show=show, tested=lambda run: None)
+        learners.train_rest(run, show=show, tested=lambda run: None)
     except KeyboardInterrupt:
         return False
     return True

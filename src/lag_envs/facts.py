@@ -14,7 +14,7 @@ import numpy as np
 from lag_envs.envs.single import observation_space
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import layout_of
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 from lag_envs.tasks.base import Task
 
 
@@ -48,7 +48,7 @@ def facts(task: Task, name: str) -> list[str]:
 
 
 def _indented(rows: list[tuple[str, ...]]) -> list[str]:
-    return [f"  {line}" for line in columns(rows)] if rows else ["  none"]
+    return [f"  {line}" for line in aligned(rows)] if rows else ["  none"]
 
 
 def _description(task: Task) -> str:

@@ -38,7 +38,7 @@ class NamedAgent(NamedTuple):
     about: str
 
 
-def known(task: Any, env_id: str) -> list[NamedAgent]:
+def named_agents(task: Any, env_id: str) -> list[NamedAgent]:
     """Return the named agents of an environment, the default one first."""
     found = []
     if (own := shipped().get(env_id)) is not None:
@@ -55,7 +55,7 @@ def known(task: Any, env_id: str) -> list[NamedAgent]:
     return found
 
 
-def load(env_id: str, task: Any, name: str | None, board: Path | None = None) -> tuple[str, Any]:
+def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = None) -> tuple[str, Any]:
     """Return an agent's name, and an object with the `predict` of Stable-Baselines3.
 
     Parameters
@@ -65,9 +65,9 @@ def load(env_id: str, task: Any, name: str | None, board: Path | None = None) ->
     task : Task
         Its task.
     name : str, optional
-        One of `known`, a verified submission of the board by name or id, or the path of a submission's
+        One of `named_agents`, a verified submission of the board by name or id, or the path of a submission's
         folder, of a model of Stable-Baselines3 or of the folder of its training. By default the first of
-        `known`.
+        `named_agents`.
     board : Path, optional
         A board's folder.
 
@@ -76,7 +76,7 @@ def load(env_id: str, task: Any, name: str | None, board: Path | None = None) ->
     UserError
         If there is no such agent, or it does not fit this environment.
     """
-    names = {agent.name.lower(): agent.name for agent in known(task, env_id)}
+    names = {agent.name.lower(): agent.name for agent in named_agents(task, env_id)}
     name = next(iter(names.values())) if name is None else names.get(name.lower(), name)
     own = shipped().get(env_id)
     if own is not None and name == own.name:

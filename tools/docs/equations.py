@@ -16,7 +16,7 @@ from sympy.simplify.fu import TR10i
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene, symbolic
 from lag_envs.scenes.derivation import layout_of
-from tools.docs.markdown import described, groups
+from tools.docs.markdown import groups, parameter_descriptions
 
 #: A letter by itself, which is the symbol that a docstring gives a parameter: "Mass m of the bar."
 LETTER = re.compile(r"(?<![\w'/=])[A-Zb-zα-ωΑ-Ω](?![\w'/(=²])")
@@ -31,7 +31,7 @@ def symbol(scene: type[Scene], name: str) -> str:
     >>> symbol(PivotedBar, "com_distance"), symbol(Acrobot, "mass_1")
     ('L', 'm_{1}')
     """
-    found = LETTER.search(described(scene).get(name, ""))
+    found = LETTER.search(parameter_descriptions(scene).get(name, ""))
     if not found:
         return _word(name)
     together = [one.split("_") for one in groups(scene)[name]]
@@ -40,12 +40,12 @@ def symbol(scene: type[Scene], name: str) -> str:
     return f"{letter}_{{{','.join(own)}}}" if own else letter
 
 
-def lagrangian(scene: Scene) -> str:
+def lagrangian_expression(scene: Scene) -> str:
     """Return T - V."""
     return rf"\mathcal{{L}} = {_latex(scene, symbolic.lagrangian(scene))}"
 
 
-def equations(scene: Scene) -> list[str]:
+def lagrange_equations(scene: Scene) -> list[str]:
     """Return the equations of motion: Lagrange's, one for each free coordinate, without denominators."""
     found = []
     for name in layout_of(scene).free:
@@ -124,7 +124,7 @@ def _word(name: str) -> str:
     return rf"\mathrm{{{name}}}".replace("_", r"\ ")
 
 
-def mathml(latex: str, block: bool = True) -> str:
+def formula_mathml(latex: str, block: bool = True) -> str:
     """Return a formula as MathML that includes its LaTeX; a block formula can be scrolled sideways."""
     element = convert(latex, display="block" if block else "inline")
     head, body = re.fullmatch(r"(<math[^>]*>)(.*)</math>", element, re.DOTALL).groups()  # type: ignore[union-attr]

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from lag_envs.device import DeviceEnvs
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 #: Numbers copied to measure the memory, more than any cache holds.
 COPIED = 2**28
@@ -92,7 +92,7 @@ def table(found: Sequence[DeviceRate]) -> str:
         (r.id, str(r.dtype).removeprefix("torch."), f"{r.num_envs:,}", f"{r.steps:.3g}", f"{r.share:.0%}")
         for r in found
     ]
-    return "\n".join(columns([head, *rows]))
+    return "\n".join(aligned([head, *rows]))
 
 
 def _bandwidth(device: str | torch.device, seconds: float, rounds: int) -> float:

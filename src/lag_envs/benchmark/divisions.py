@@ -67,14 +67,14 @@ def _divided(env_id: str) -> dict[str, Any]:
 HEAD = ("id", "series a step", "most", "steps that are divided", "fastest [1/s]", "time of a series")
 
 
-def cells(row: Mapping[str, Any], nanoseconds: float | None) -> tuple[str, ...]:
+def table_row(row: Mapping[str, Any], nanoseconds: float | None) -> tuple[str, ...]:
     """Return a line of the table; `nanoseconds` is the time of a step, if it was measured."""
     each = "" if nanoseconds is None else f"{nanoseconds / row['mean']:,.0f} ns"
     share = f"{100.0 * row['divided']:.0f} %"
     return row["id"], f"{row['mean']:.2f}", str(row["most"]), share, f"{row['fastest']:.1f}", each
 
 
-def markdown(rows: Sequence[Mapping[str, Any]], times: Mapping[str, float]) -> str:
+def divisions_markdown(rows: Sequence[Mapping[str, Any]], times: Mapping[str, float]) -> str:
     """Return the table of environments with divided steps, with the times of their steps [ns]."""
-    lines = [cells(row, times.get(row["id"])) for row in rows if row["most"] > 1]
+    lines = [table_row(row, times.get(row["id"])) for row in rows if row["most"] > 1]
     return markdown_table(list(HEAD), [list(line) for line in lines])

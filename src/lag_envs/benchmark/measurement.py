@@ -12,14 +12,14 @@ from lag_envs.benchmark import cold_start
 from lag_envs.benchmark.console import table
 from lag_envs.benchmark.contestants import contestants
 from lag_envs.benchmark.divisions import divisions
-from lag_envs.benchmark.docs import take_over, to_json
+from lag_envs.benchmark.docs import report_json, take_over
 from lag_envs.benchmark.energies import chains, of_energies
 from lag_envs.benchmark.jacobians import backwards, jacobians
 from lag_envs.benchmark.peak import arithmetic
-from lag_envs.benchmark.results import speedups, summary
-from lag_envs.benchmark.rounds import CLOCKS, measure
+from lag_envs.benchmark.results import row_summary, speedups
+from lag_envs.benchmark.rounds import CLOCKS, measure_rates
 from lag_envs.benchmark.targets import verdicts
-from lag_envs.host import installed, machine
+from lag_envs.host import installed_versions, machine
 from lag_envs.own_files import registered
 from lag_envs.tasks import TASKS
 
@@ -58,16 +58,16 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         rows += of_energies(settings.sizes)
     times: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
+    complete = measure_rates(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
     if complete and settings.cold_starts:
         complete = cold_start.cold_starts(settings.ids[0], settings.cold_starts, times, settings.files)
-    cold = {cache: cold_start.summary(some) for cache, some in times.items()}
-    results = [summary(row, rows) for row in rows]
+    cold = {cache: cold_start.start_summary(some) for cache, some in times.items()}
+    results = [row_summary(row, rows) for row in rows]
     report: dict[str, Any] = {
         "date": settings.date,
         "complete": complete,
         "machine": machine() | {"load_at_start": load},
-        "versions": {"lag_envs": lag_envs.__version__} | installed(LIBRARIES),
+        "versions": {"lag_envs": lag_envs.__version__} | installed_versions(LIBRARIES),
         "settings": asdict(settings),
         "rows": results,
         "cold_start": cold,
@@ -83,7 +83,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         report["divisions"] = divisions(settings.ids)
     print("\n".join(table(report)))
     if settings.output:
-        Path(settings.output).write_text(to_json(report), encoding="utf-8")
+        Path(settings.output).write_text(report_json(report), encoding="utf-8")
         print(f"written to {settings.output}")
     if settings.checkout and complete:
         take_over(report, Path(settings.checkout))

@@ -37,7 +37,7 @@ ENERGIES, VARIED, THREADED = "lag_envs, energies", "lag_envs, varied", "lag_envs
 CORE = "this core"
 
 
-def measure(
+def measure_rates(
     rows: Sequence[Contestant], rounds: int, seconds: float, clock: Clock = time.perf_counter
 ) -> bool:
     """Fill in the contestants' rates; return False if the user interrupted it, keeping the rates so far."""

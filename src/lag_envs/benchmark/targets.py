@@ -60,7 +60,7 @@ def has_own_flow(env_id: str) -> bool:
     return env_id in TASKS and not TASKS[env_id].imperfections and form_of(TASKS[env_id]().scene) is not None
 
 
-def reached(rows: Sequence[dict[str, Any]], target: SpeedTarget) -> dict[str, float]:
+def reached_targets(rows: Sequence[dict[str, Any]], target: SpeedTarget) -> dict[str, float]:
     """Return the median ratio of each row that should reach a target."""
     return {row["id"]: row["ratio"][1] for row in rows if "ratio" in row and target.meant_for(row)}
 
@@ -69,7 +69,7 @@ def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> li
     """Compare the measurements with the targets; ``met`` is None if nothing was measured."""
     results = []
     for target in (*TARGETS, *SERIES_TARGETS):
-        measured = reached(rows, target)
+        measured = reached_targets(rows, target)
         met = all(value >= target.ratio for value in measured.values()) if measured else None
         goal = f"{target}: at least {target.ratio:g} x CartPole-v1"
         results.append({"target": goal, "limit": target.ratio, "met": met, "measured": measured})

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, declare_date, known, needs, seconds
+from lag_envs.commands.base import OWN, Command, count, declare_date, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.own_files import is_file
@@ -152,7 +152,7 @@ def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     files = tuple(dict.fromkeys(name for name in names if is_file(name)))
     ids: list[str] = []
     for name in names:
-        ids += own_files.registered(name) if name in files else [known(name)]
+        ids += own_files.registered(name) if name in files else [known_id(name)]
     return tuple(dict.fromkeys(ids)), files
 
 

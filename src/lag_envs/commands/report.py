@@ -80,9 +80,9 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
     if len(files) > 1 or len(folders) > 1:
         raise UserError(f"at most one FILE and one FOLDER, got {' '.join(places)}")
     if files:
-        from lag_envs.own_files import split
+        from lag_envs.own_files import split_path
 
-        return files[0], folders[0] if folders else f"report-{Path(split(files[0])[0]).stem}"
+        return files[0], folders[0] if folders else f"report-{Path(split_path(files[0])[0]).stem}"
     return "", folders[0] if folders else "report"
 
 

@@ -22,7 +22,9 @@ from lag_envs.tasks.base import Task
 Array = NDArray[np.float64]
 
 
-def cost(task: Task, state: Sequence[float] | Array, control: float = 0.0, target: float = 0.0) -> Array:
+def quadratic_cost(
+    task: Task, state: Sequence[float] | Array, control: float = 0.0, target: float = 0.0
+) -> Array:
     """Return the matrix C of a step's loss (x, u)' C (x, u), the reward's to second order.
 
     Parameters
@@ -66,7 +68,7 @@ def regulator(
         Additional costs of a step of the task's own interval: weights of the squares of states, by name, and
         of "u".
     """
-    c = cost(task, state, control, target)
+    c = quadratic_cost(task, state, control, target)
     names = [*task.scene.state_names, "u"]
     for name, weight in (extra or {}).items():
         c[names.index(name), names.index(name)] += weight * task.dt / task.interval

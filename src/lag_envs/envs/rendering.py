@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from lag_envs.envs import raster
 from lag_envs.envs.forces import Forces
 from lag_envs.scenes import shapes as s
-from lag_envs.scenes.picture import Picture, turning
+from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import Frame, Point, Pose, Reading, Role, Shape, Window
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 
 if TYPE_CHECKING:
     import pygame
@@ -265,7 +265,7 @@ class Viewer:
 
     def _turn(self, state: list[float]) -> None:
         """Integrate angles that the state leaves out; exact if rates are linear and every step is drawn."""
-        rate = np.array(turning(self._task.scene, state))
+        rate = np.array(left_out_rates(self._task.scene, state))
         if self._before is not None and self._before[0] != state:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
         self._before = (state, rate)
@@ -288,7 +288,7 @@ class Viewer:
 
 def _scale(task: Task) -> tuple[float, float] | None:
     """Return the returns with scores 0 and 1; None if the task's parameters are not the standard ones."""
-    known, usual = measured(task.id).get("scale"), type(task)()
+    known, usual = measured_entry(task.id).get("scale"), type(task)()
     same = (task.scene, task.dt, task.duration) == (usual.scene, usual.dt, usual.duration)
     return (known["random"], known["best"]) if known and same else None
 

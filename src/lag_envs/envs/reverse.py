@@ -20,7 +20,7 @@ from lag_envs.envs.program import constants_of
 from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import pulled
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
-from lag_envs.stepping.flows import split
+from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
 
@@ -178,16 +178,16 @@ class Reverse:
         by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
         bars = [x for name in ("by_r", "by_o", "by_e") for x in seeds[name]]
         found = xp.adjoint(outputs, bars, [x for numbers in by for x in numbers])
-        own_y, own_z, *rest, own_e = split(found, *map(len, by[:-1]))
+        own_y, own_z, *rest, own_e = split_lengths(found, *map(len, by[:-1]))
         return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
 
     def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, **found: list) -> list[list]:
         """Record the way back from the controls, and all sums: cotangents of y, a, g and parameters."""
-        by_y, by_u, by_p = split(found["moved"], len(y), len(found["own_u"]))
+        by_y, by_u, by_p = split_lengths(found["moved"], len(y), len(found["own_u"]))
         by = [y, a, g, self._parameters_of(k)]
         bars = _sums(found["own_u"], by_u)
         own = xp.adjoint(self._control_of(xp, k, y, a, g)[0], bars, [x for numbers in by for x in numbers])
-        last_y, last_a, last_g, last_p = split(own, *map(len, by[:-1]))
+        last_y, last_a, last_g, last_p = split_lengths(own, *map(len, by[:-1]))
         by_y, by_p = _sums(found["own_y"], by_y, last_y), _sums(found["own_p"], by_p, last_p)
         return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
 

@@ -48,7 +48,7 @@ def words(blocks: int) -> int:
     return WORDS + 2 * blocks
 
 
-def describe(ids: NDArray[np.uint64], count: int, kept: Sequence[str]) -> None:
+def write_places(ids: NDArray[np.uint64], count: int, kept: Sequence[str]) -> None:
     """Write into a batch's keys where its rows lie."""
     ids[3 * count + 10 : 3 * count + 12] = len(kept) * BLOCK, kept.index("n") * BLOCK
 
@@ -113,7 +113,7 @@ def _step_all(  # type: ignore[no-untyped-def]
 
 
 def _bad_action(f, action, count, size, first):  # type: ignore[no-untyped-def]
-    """Return -(i + 1) if action i is not finite, or 0; of a row in `f`, see `describe`.
+    """Return -(i + 1) if action i is not finite, or 0; of a row in `f`, see `write_places`.
 
     An environment that is to be restarted ignores its action.
     """

@@ -43,7 +43,7 @@ import numpy as np
 from lag_envs.envs.actions import Actions
 from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.program import DRAWS
-from lag_envs.envs.single import key_of
+from lag_envs.envs.single import seed_key
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values
 from lag_envs.scenes import picture
@@ -51,9 +51,9 @@ from lag_envs.scenes.base import ORDER
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.scenes.shapes import Frame
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.flows import split
+from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.general import stepper_of, usual_order
-from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
+from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, run_python, script_motion
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.tasks.base import Task
@@ -246,7 +246,7 @@ class UnfusedProgram:
         inputs = {f"i{n}": value for n, value in enumerate(value for values in given for value in values)}
 
         def recorded(xp: Any, *numbers: Any) -> list:
-            *lists, rest = split(numbers, *sizes)
+            *lists, rest = split_lengths(numbers, *sizes)
             return list(formula(xp, *lists, SimpleNamespace(**dict(zip(self._k, rest, strict=True)))))
 
         return t.formula(recorded, inputs | self._k)
@@ -331,7 +331,7 @@ class UnfusedProgram:
         found = self._run(t, outcome, y, z, u, g)
 
         def turn(xp: Any, turned: Sequence, y: Sequence, z: Sequence, k: Any) -> list:
-            rates = [picture.turning(scene, x) for x in (y, z)]
+            rates = [picture.left_out_rates(scene, x) for x in (y, z)]
             return [
                 x + 0.5 * k.dt * (before + after) for x, before, after in zip(turned, *rates, strict=True)
             ]
@@ -362,7 +362,7 @@ class UnfusedProgram:
         given = dict(zip((*wanted, *moving), self._run(t, prepare, y, u), strict=True))
         inputs = {name: given.get(name) or self._k[f"motion_{name}"] for name in record.given}
         places, velocities = [given[x] for x in moving[:n]], [given[x] for x in moving[n:]]
-        q, v, refused = motion(t, record, inputs, places, velocities, dt, self._order, self._tolerance)
+        q, v, refused = script_motion(t, record, inputs, places, velocities, dt, self._order, self._tolerance)
         return self._run(t, finish, q, v, y, u), refused
 
     def _kick(self, t: Script) -> None:
@@ -523,7 +523,7 @@ class Unfused:
         """Begin the episode that a new environment would begin with this seed; return the observation."""
         from lag_envs.stepping.primitives import episode_key
 
-        self._key = episode_key(np.uint64(key_of(seed)), np.uint64(1))
+        self._key = episode_key(np.uint64(seed_key(seed)), np.uint64(1))
         self.steps = 0
         program, rest = self.program, np.atleast_1d(self.task.formulas.rest_action).tolist()
         self._waiting = [rest] * program.delay

@@ -26,8 +26,8 @@ from lag_envs.envs.single import (
     check_render_mode,
     check_seed,
     diagnostics,
-    key_of,
     observation_space,
+    seed_key,
     start_options,
     true_spec,
 )
@@ -156,7 +156,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._memory = on_a_line(np.zeros(blocks * len(program.kept) * BLOCK))
         #: Keys of the seeds, numbers of the episodes, keys of the episodes, and numbers that threads share.
         self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
-        sharing.describe(self._ids, self.num_envs, program.kept)
+        sharing.write_places(self._ids, self.num_envs, program.kept)
         #: Number of the step, counted over all episodes, and how many threads it can keep busy.
         self._turn, self._most_threads = 0, min(blocks, self._num_threads or self.num_envs // sharing.SHARE)
         self._lanes = np.arange(self.num_envs)
@@ -214,11 +214,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         lanes = self._lanes[mask]
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
-            state = np.array([named(i, self.tasks[i].start_state, state[i]) for i in lanes])
+            state = np.array([for_environment(i, self.tasks[i].start_state, state[i]) for i in lanes])
         if target is not None:
             many = self.task.formulas.targets
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
-            target = np.array([np.atleast_1d(named(i, self.tasks[i].check_target, target[i])) for i in lanes])
+            target = np.array(
+                [np.atleast_1d(for_environment(i, self.tasks[i].check_target, target[i])) for i in lanes]
+            )
         if not self._started and not mask.all():
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
@@ -228,7 +230,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._ids[: self.num_envs] = self.np_random.integers(2**63, size=self.num_envs)
         for i, s in seeds:
             if mask[i]:
-                self._ids[i], self._ids[self.num_envs + i] = key_of(s), 0
+                self._ids[i], self._ids[self.num_envs + i] = seed_key(s), 0
         if state is not None:
             for j, column in enumerate(state.T):
                 self._write(f"y{j}", lanes, column)
@@ -371,7 +373,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         ResetNeeded
             Before the first reset, if the mask does not select all environments.
         """
-        snapshots.check(snapshot, self._about, self._program.kept)
+        snapshots.check_snapshot(snapshot, self._about, self._program.kept)
         mask = self._check_mask(mask, "mask")
         if not self._started and not mask.all():
             raise ResetNeeded("call reset() before set_state() with a mask that leaves some out")
@@ -388,7 +390,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         """The properties that a snapshot must share."""
         options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
         limit = self._constants[0]["limit"]
-        return snapshots.about(self.tasks, **options, max_episode_steps=limit, order=self.order)
+        return snapshots.properties(self.tasks, **options, max_episode_steps=limit, order=self.order)
 
     # --- for inspection ------------------------------------------------------------------------------------
 
@@ -455,7 +457,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: the current pictures, spaces, controls, parameters."""
-        from lag_envs.envs.html import described, still
+        from lag_envs.envs.html import environment_html, still
         from lag_envs.envs.rendering import columns_of, tiled
 
         shown, pictures = self.tasks[:9], []
@@ -468,7 +470,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         title = f"{self.spec.id if self.spec else type(self.task).__name__} × {self.num_envs}"
         spaces = {"observation of each": self.single_observation_space, "action": self.single_action_space}
         grid = tiled(pictures, columns) if pictures else None
-        return described(self.task, title, spaces, grid)
+        return environment_html(self.task, title, spaces, grid)
 
     # --- internal ------------------------------------------------------------------------------------------
 
@@ -627,7 +629,7 @@ def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float6
     return copy
 
 
-def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
+def for_environment(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
     """Call a function; if it raises a ValueError, add that this was for environment i."""
     try:
         return function(*arguments, **keywords)
@@ -679,7 +681,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     if not many:
         return [kind(**options)] * n
     own = [options | {name: values[i] for name, values in many.items()} for i in range(n)]
-    tasks = [named(i, kind, **own[i]) for i in range(n)]
+    tasks = [for_environment(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
             "the environments of a batch may differ in numbers only: they must agree in structural options, "

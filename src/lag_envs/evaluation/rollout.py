@@ -289,7 +289,7 @@ class Episodes:
         return np.where(last > self.steps, np.inf, last * self.task.dt)
 
 
-def record(rollout: Rollout, *watchers: Callable[[RolloutStep], Any]) -> Episodes:
+def record_rollout(rollout: Rollout, *watchers: Callable[[RolloutStep], Any]) -> Episodes:
     """Take all steps of a roll-out, show each to the watchers, and return a record of it."""
     states, steps = [rollout.state.copy()], []
     for step in rollout:

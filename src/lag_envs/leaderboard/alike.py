@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.evaluation.rollout import Episodes, PolicyError, Rollout, act, record
+from lag_envs.evaluation.rollout import Episodes, PolicyError, Rollout, act, record_rollout
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.policies import SubmittedPolicy
 from lag_envs.leaderboard.submission import Refused, Submission
@@ -110,7 +110,7 @@ def track(env_id: str, policy: SubmittedPolicy, nonce: str) -> PlayedPolicy:
     first = protocol.first_seed(f"alike {env_id}", nonce, 0)
     rollout = Rollout(env_id, policy.agent(), range(first, first + EPISODES))
     try:
-        played = record(rollout)
+        played = record_rollout(rollout)
     except PolicyError as error:
         raise Refused(str(error)) from error
     return PlayedPolicy(policy, played, rollout.returns, rollout.memory is None)

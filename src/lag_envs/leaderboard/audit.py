@@ -28,7 +28,7 @@ from pydantic import Field
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, others
-from lag_envs.leaderboard.fields import Strict, checked, plain, shown
+from lag_envs.leaderboard.fields import Strict, ascii_text, checked, shown_ascii
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
     COMMIT,
@@ -49,8 +49,8 @@ from lag_envs.leaderboard.log import (
     read_log,
 )
 from lag_envs.leaderboard.pending import Neighbours, claimed, shown_episodes
-from lag_envs.leaderboard.results import apart, build, compare
-from lag_envs.store import write
+from lag_envs.leaderboard.results import apart, code_digest, compare_results
+from lag_envs.store import write_file
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About
@@ -171,7 +171,7 @@ def write_pin(board: Board, file: Path) -> Pin:
     if not log:
         raise BoardError(f"{board.log} is empty; there is nothing to pin")
     pin = pin_of(log)
-    write(file, json.dumps(pin.model_dump(), indent=2) + "\n")
+    write_file(file, json.dumps(pin.model_dump(), indent=2) + "\n")
     return pin
 
 
@@ -233,7 +233,9 @@ def _submissions(board: Board, found: CheapChecks) -> Finding:
             continue  # it was accepted once; since then its environment, say, has gone
         for name in ("env", "name", "authors", "kind"):
             if (noted := getattr(entry, name)) != (said := getattr(told, name)):
-                finding.wrong.append(f"{where} says {name} {shown(said)}, the log {shown(noted)}; {REMEDY}")
+                finding.wrong.append(
+                    f"{where} says {name} {shown_ascii(said)}, the log {shown_ascii(noted)}; {REMEDY}"
+                )
     finding.told = f"{len(entries)} are what was added"
     return finding
 
@@ -274,7 +276,7 @@ def _odd(found: CheapChecks, entry: BoardEntry, result: Mapping[str, Any]) -> It
     """Yield statements of a result that cannot be true."""
     for name in ("env", "digest", "nonce"):
         if result[name] != getattr(entry, name):
-            yield f"is of {name} {shown(result[name])}, not {shown(getattr(entry, name))}"
+            yield f"is of {name} {shown_ascii(result[name])}, not {shown_ascii(getattr(entry, name))}"
     if (told := found.state.protocols.get(entry.protocol)) is not None:
         if result["episodes"] != told.rules.episodes:
             yield f"has {result['episodes']} episodes, not {told.rules.episodes}"
@@ -320,7 +322,7 @@ def git(folder: Path, *arguments: str) -> bytes:
         raise NoHistory("git takes more than a minute") from None
     except subprocess.CalledProcessError as error:
         said = error.stderr.decode(errors="replace").strip().split("\n")[0]
-        raise NoHistory(f"git says {shown(said)}") from None
+        raise NoHistory(f"git says {shown_ascii(said)}") from None
 
 
 def log_at(folder: Path, commit: str) -> bytes:
@@ -398,7 +400,7 @@ def _nonces(board: Board, found: CheapChecks) -> Finding:
     finding = Finding("nonces")
     held, elsewhere = 0, []
     for number, value, source in found.state.nonces:
-        where = f"{board.log}, line {number}: the nonce {shown(value)}"
+        where = f"{board.log}, line {number}: the nonce {shown_ascii(value)}"
         if source not in ("", COMMIT):
             elsewhere.append(f"line {number}: {value} by {source}")
             continue
@@ -509,7 +511,7 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
     """Play the recorded episodes of each policy again, and some more that nobody can foresee."""
     from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
-    from lag_envs.leaderboard.verify import replay
+    from lag_envs.leaderboard.verify import record_again
 
     finding, draw, played, results = Finding("scores"), random.SystemRandom(), 0, 0
     for entry, result, way, where in _playable(board, found):
@@ -519,14 +521,14 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
         middle, recorded = shown_episodes(result)
         odd: list[str] = []
         # On another build, one of these few episodes may be a different one altogether.
-        tolerated = int(result.get("build") != build())
+        tolerated = int(result.get("build") != code_digest())
         plans = submission.architecture.plans
         for number, policy in enumerate(result["policies"]):
             chosen = draw.sample(range(result["episodes"]), min(SAMPLE, result["episodes"]))
             if number == middle:
                 chosen += [i for i in recorded.values() if i not in chosen]
             try:
-                again, episodes = replay(submission, dict(result), number, chosen)
+                again, episodes = record_again(submission, dict(result), number, chosen)
             except (PolicyError, Refused) as error:
                 odd.append(f"a policy that {error}")
                 continue
@@ -548,7 +550,7 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
                     if not _same_episode(told, made[told["reset_seed"]])
                 ][tolerated:]
         results += 1
-        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} again" for what in odd]
+        finding.wrong += [f"{where} has {ascii_text(what)}; verify {entry.id} again" for what in odd]
     finding.told = f"{played} episodes of {results} results were played again"
     return finding
 
@@ -580,9 +582,11 @@ def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]
             continue
         try:
             again = verify(submission, entry.nonce, result["episodes"])
-            compared = compare(result, again, way, submission.architecture.plans)
+            compared = compare_results(result, again, way, submission.architecture.plans)
         except (Refused, ValueError) as error:
-            finding.wrong.append(f"{where} cannot be verified again: {plain(error)}; withdraw {entry.id}")
+            finding.wrong.append(
+                f"{where} cannot be verified again: {ascii_text(error)}; withdraw {entry.id}"
+            )
             continue
         finding.wrong += [f"{where} differs in {what}; verify {entry.id} again" for what in compared.far]
         same, bits = same + (not compared.far), bits + compared.same

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs import store
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import shown
+from lag_envs.leaderboard.fields import shown_ascii
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
     LOG,
@@ -255,12 +255,12 @@ class Board:
         """
         if not re.fullmatch(r"[!-~]{1,200}", nonce):
             raise BoardError(
-                f"a nonce is 1 to 200 printable ASCII characters without spaces, got {shown(nonce)}"
+                f"a nonce is 1 to 200 printable ASCII characters without spaces, got {shown_ascii(nonce)}"
             )
         with self.change() as (state, append):
             if any(nonce == value for _, value, _ in state.nonces):
                 raise BoardError(
-                    f"the nonce {shown(nonce)} was published before, so it was known; take another"
+                    f"the nonce {shown_ascii(nonce)} was published before, so it was known; take another"
                 )
             append("nonce", value=nonce, source=source)
 
@@ -295,7 +295,7 @@ class Board:
             if left := [other for other in others(state, entry) if other.id not in alike]:
                 return left
             path = self.result_file(entry)
-            store.write(path, content, sync=True)
+            store.write_file(path, content, sync=True)
             near = [found for found in alike.values() if found is not None]
             same = [
                 old.id for old in state.entries.values() if old.state == "verified" and same_agent(old, entry)

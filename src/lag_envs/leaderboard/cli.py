@@ -15,7 +15,7 @@ from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.log import COMMIT, BoardEntry, BoardError, BoardState
 from lag_envs.leaderboard.pending import PendingCheck, finish
 from lag_envs.leaderboard.standings import board_data, page_data
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 #: Examples of each action, the simplest use first.
 EXAMPLES = {
@@ -148,7 +148,7 @@ def _positive(text: str) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.fields import plain
+    from lag_envs.leaderboard.fields import ascii_text
     from lag_envs.leaderboard.submission import Refused, load
 
     board = Board(args.board)
@@ -158,7 +158,7 @@ def _add(args: argparse.Namespace) -> int:
             entry = board.add(load(folder))
         except (Refused, BoardError, OSError) as error:
             failed += 1
-            print(f"{plain(folder)}: refused: {error}", file=sys.stderr)
+            print(f"{ascii_text(folder)}: refused: {error}", file=sys.stderr)
             continue
         added.append(entry.id)
         if entry.state != "pending":
@@ -267,7 +267,7 @@ def _list(args: argparse.Namespace) -> int:
             told = (row["kind"], _plain(row["name"]), row["id"] + _remark(row))
             rank = "-" if row["rank"] is None else str(row["rank"])
             lines.append((rank, f"{row['score']:.4f}", ends, success, *told))
-        print("\n".join("  " + line for line in columns(lines)), end="\n" * bool(lines))
+        print("\n".join("  " + line for line in aligned(lines)), end="\n" * bool(lines))
         for other in found["other"]:
             reason = f": {_plain(other['reason'])}" if other["reason"] else ""
             print(f"  {other['id']} {other['state']}{reason}")
@@ -342,7 +342,7 @@ def _show(args: argparse.Namespace) -> int:
         for key, value in (told | row).items()
         if value not in (None, "", False)
     ]
-    print("\n".join(columns([(key, _plain(value)) for key, value in shown])))
+    print("\n".join(aligned([(key, _plain(value)) for key, value in shown])))
     return 0
 
 
@@ -400,9 +400,9 @@ def _pin(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.site.build import build
+    from lag_envs.leaderboard.site.build import write_page
 
-    build(page_data(Board(args.board)), args.out, args.url)
+    write_page(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0
 
@@ -412,14 +412,14 @@ def _serve(args: argparse.Namespace) -> int:
     from functools import partial
     from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
-    from lag_envs.leaderboard.site.build import build
+    from lag_envs.leaderboard.site.build import write_page
 
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *args: Any) -> None:
             pass
 
     with tempfile.TemporaryDirectory() as folder:
-        build(page_data(Board(args.board)), Path(folder))
+        write_page(page_data(Board(args.board)), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except (OSError, OverflowError) as error:

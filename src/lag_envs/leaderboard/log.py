@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
 from lag_envs.leaderboard import fields
-from lag_envs.leaderboard.fields import Strict, between, checked, shown
+from lag_envs.leaderboard.fields import Strict, between, checked, shown_ascii
 from lag_envs.leaderboard.files import read_plain
 
 LOG = "board.jsonl"
@@ -235,7 +235,7 @@ def parse(log: bytes) -> tuple[list[LogLine], bytes]:
             except ValueError as error:
                 if last:
                     return lines, tail
-                told = shown(line[:60].decode(errors="replace"))
+                told = shown_ascii(line[:60].decode(errors="replace"))
                 raise _damaged(number, f"is no event ({error}): {told}") from None
             if chained and event.prev is None:
                 raise _damaged(number, "holds no hash of the lines before it")
@@ -327,7 +327,9 @@ class BoardState:
     def entry(self, id: str) -> BoardEntry:
         """Return an entry under the current protocol, or raise a BoardError."""
         if id not in self.entries:
-            raise BoardError(f"there is no {shown(id)} on the board; `lag-envs leaderboard list` names all")
+            raise BoardError(
+                f"there is no {shown_ascii(id)} on the board; `lag-envs leaderboard list` names all"
+            )
         return self.entries[id]
 
     def nonce(self, entry: BoardEntry) -> str | None:
@@ -382,7 +384,7 @@ def _apply(state: BoardState, event: Any, line: int) -> None:
         _join(state, event)
     elif isinstance(event, Nonce):
         if any(event.value == value for _, value, _ in state.nonces):
-            raise ValueError(f"the nonce {shown(event.value)} was published before, so it was known")
+            raise ValueError(f"the nonce {shown_ascii(event.value)} was published before, so it was known")
         state.nonces.append((line, event.value, event.source))
     elif isinstance(event, Added):
         _add(state, event, line)
@@ -470,7 +472,9 @@ def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
         state.entries[event.id] = replace(known, state="rejected", reason=event.reason)
         return
     if event.nonce != state.nonce(known):
-        raise ValueError(f"{event.id} is verified with the nonce {shown(event.nonce)}, which is not its own")
+        raise ValueError(
+            f"{event.id} is verified with the nonce {shown_ascii(event.nonce)}, which is not its own"
+        )
     for old in [*event.supersedes, *(like.id for like in event.alike)]:
         other = state.entries.get(old)
         if other is None or old == event.id or not other.sha256 or other.env != known.env:

@@ -20,7 +20,7 @@ from lag_envs.leaderboard.architecture import (
     PolicyTable,
     Remembering,
 )
-from lag_envs.leaderboard.fields import Strict, between, many
+from lag_envs.leaderboard.fields import Strict, between, length_between
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -55,7 +55,7 @@ class Normalise(Strict):
 class NetworkTable(PolicyTable):
     """The fields that all networks' tables share."""
 
-    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)]
+    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], length_between(0, protocol.LAYERS)]
     activation: Literal["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"] = "tanh"
     bins: Annotated[int, between(2, 1_001)] | None = None
     squash: Literal["clip", "tanh"] | None = None
@@ -87,9 +87,9 @@ class GRUTable(NetworkTable):
     """The table of a network with a gated recurrent unit."""
 
     memory: Annotated[int, between(1, protocol.MEMORY)]
-    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)] = Field(
-        default=[]
-    )
+    hidden: Annotated[
+        list[Annotated[int, between(1, protocol.WIDTH)]], length_between(0, protocol.LAYERS)
+    ] = Field(default=[])
 
 
 class Network(Architecture):

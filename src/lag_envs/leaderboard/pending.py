@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, closed, current
 from lag_envs.leaderboard.log import REMEDY, Alike, BoardEntry, BoardError
-from lag_envs.leaderboard.results import check
+from lag_envs.leaderboard.results import checked_result
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About, Submission
@@ -43,7 +43,9 @@ class PendingCheck:
         check_twins(submission, nonce)
         result = verify(submission, nonce, protocol.EPISODES, progress)
         # A result that the board cannot keep fails here, without harm to the others.
-        return check(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
+        return checked_result(
+            result | {"claimed": claimed(submission), "replays": replays(submission, result)}
+        )
 
 
 def claimed(submission: About) -> dict[str, Any]:
@@ -65,10 +67,10 @@ def claimed(submission: About) -> dict[str, Any]:
 
 def replays(submission: Submission, result: dict[str, Any]) -> list[dict[str, Any]]:
     """Return recordings of the median policy's median, best and worst episode."""
-    from lag_envs.leaderboard.verify import replay
+    from lag_envs.leaderboard.verify import record_again
 
     policy, chosen = shown_episodes(result)
-    _, found = replay(submission, result, policy, list(chosen.values()))
+    _, found = record_again(submission, result, policy, list(chosen.values()))
     return [{"label": label} | episode for label, episode in zip(chosen, found, strict=True)]
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from pydantic import Field, create_model
 
 from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
-from lag_envs.leaderboard.fields import Strict, accepted, between, shown
+from lag_envs.leaderboard.fields import Strict, accepted, between, shown_ascii
 from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, MLP, Linear
 from lag_envs.leaderboard.planning import PlanAhead
@@ -70,7 +70,7 @@ def architecture(env_id: str, table: Mapping[str, Any]) -> Architecture:
     name = table.get("architecture")
     if not isinstance(name, str) or name not in ARCHITECTURES:
         known = ", ".join(sorted(ARCHITECTURES))
-        raise Refused(f"{POLICY}: architecture must be one of {known}, got {shown(name)}")
+        raise Refused(f"{POLICY}: architecture must be one of {known}, got {shown_ascii(name)}")
     kind = ARCHITECTURES[name]
     return kind(env_id, accepted(kind.table, dict(table), POLICY))
 
@@ -102,7 +102,7 @@ class ControllerPolicy(Architecture):
         self.task = TASKS[env_id]()
         known = controllers(self.task)
         if table.name not in known:
-            raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown(table.name)}")
+            raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown_ascii(table.name)}")
         found = known[table.name]
         self.build, self.plans = partial(build, self.task, table.name), found.plans
         own: dict[str, Any] = {
@@ -123,7 +123,7 @@ class ControllerPolicy(Architecture):
                 warnings.simplefilter("ignore")
                 return self.build(**self.numbers)
         except Exception as error:  # nonsensical numbers may raise anything
-            reason = shown(f"{type(error).__name__}: {error}")
+            reason = shown_ascii(f"{type(error).__name__}: {error}")
             raise Refused(f"the controller cannot be made with these numbers: {reason}") from error
 
 

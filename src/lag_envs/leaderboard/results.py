@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import Strict, checked, plain
+from lag_envs.leaderboard.fields import Strict, ascii_text, checked
 from lag_envs.leaderboard.log import EnvId, Hash, Number, Text, load_json
 
 #: Largest result [bytes], packed and unpacked.
@@ -107,7 +107,7 @@ class VerificationResult(Strict):
 _RESULT: TypeAdapter[VerificationResult] = TypeAdapter(VerificationResult)
 
 
-def check(result: Any) -> dict[str, Any]:
+def checked_result(result: Any) -> dict[str, Any]:
     """Return a valid result; raise a ValueError otherwise."""
     checked(_RESULT, result)
     return result
@@ -124,7 +124,7 @@ def unpacked(content: bytes) -> dict[str, Any]:
         raise ValueError(f"it cannot be unpacked: {type(error).__name__}: {error}") from None
     if len(text) > UNPACKED:
         raise ValueError(f"it unpacks to more than {UNPACKED:,} bytes")
-    return check(load_json(text))
+    return checked_result(load_json(text))
 
 
 class ValueAxis(Strict):
@@ -161,7 +161,7 @@ def checked_value(content: bytes) -> dict[str, Any]:
 
 
 @cache
-def build() -> str:
+def code_digest() -> str:
     """Return the SHA-256 of this package's code: another build may give other bits."""
     root, total = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
@@ -194,7 +194,7 @@ class VerificationComparison(NamedTuple):
     far: list[str]
 
 
-def compare(
+def compare_results(
     result: Mapping[str, Any], other: Mapping[str, Any], way: float, plans: bool = False
 ) -> VerificationComparison:
     """Compare two verifications of the same submission with the same nonce and number of episodes.
@@ -236,7 +236,7 @@ def compare(
         raise ValueError("the results differ in their conditions")
     for name, means in conditions.items():
         if not _near(means, others[name], few * way):
-            far.append(f"the means under {plain(name)}")
+            far.append(f"the means under {ascii_text(name)}")
     same = all(a["trajectory"] == b["trajectory"] for a, b in pairs)
     same = same and all(result[name] == other[name] for name in ("robustness", "often"))
     builds = [

@@ -58,7 +58,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     BoardError
         If something on the board is not as it was logged, see `audit.sound`.
     """
-    from lag_envs.evaluation.statistics import rounded
+    from lag_envs.evaluation.statistics import rounded_data
     from lag_envs.leaderboard.audit import sound
     from lag_envs.leaderboard.combined import combined
 
@@ -74,7 +74,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
             *(_environment(board, state, results, *key, found.setdefault(key[0], {})) for key in keys),
             *(_environment(board, state, results, *key, {}) for key in frozen),
         ],
-        "combined": rounded(combined(found)),
+        "combined": rounded_data(combined(found)),
     }
 
 
@@ -87,10 +87,10 @@ def _environment(
     reached: dict[AgentIdentity, AgentScore],
 ) -> dict[str, Any]:
     """Return a board, and note the results of its ranked agents."""
-    from lag_envs.evaluation.statistics import ends, iqm, rounded
+    from lag_envs.evaluation.statistics import ends, iqm, rounded_data
     from lag_envs.leaderboard import ranking
     from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
-    from lag_envs.leaderboard.site.scenery import describe
+    from lag_envs.leaderboard.site.scenery import scenery_data
 
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
     told = state.protocols.get(number)
@@ -143,7 +143,7 @@ def _environment(
                 # Under protocol 1, the episodes of random actions were different ones.
                 if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
             ]
-            rows.append(rounded(row))
+            rows.append(rounded_data(row))
     return {
         "id": env_id,
         "protocol": number,
@@ -157,7 +157,7 @@ def _environment(
             for e in entries.values()
             if e.state != "verified"
         ],
-    } | describe(env_id)
+    } | scenery_data(env_id)
 
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:

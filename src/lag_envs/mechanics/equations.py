@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative
 
 
 def place(name: str) -> Atom:
@@ -97,14 +97,14 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
         If the kinetic energy is not a polynomial of degree two in the velocities, or lacks a coordinate.
     """
     names = (*free, *prescribed)
-    kinetic = collect(energies.kinetic)
+    kinetic = apply_identities(energies.kinetic)
     _check_velocities(kinetic)
     _check_no_velocity("potential", energies.potential)
     momenta = [derivative(kinetic, velocity(name)) for name in names]
     mass: dict[tuple[int, int], Expr] = {}
     for i in range(len(names)):
         for j in range(i, len(names)):
-            entry = collect(derivative(momenta[i], velocity(names[j])))
+            entry = apply_identities(derivative(momenta[i], velocity(names[j])))
             if entry.terms:
                 mass[i, j] = entry
     for i, name in enumerate(free):
@@ -122,7 +122,7 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
             convective = convective + derivative(momentum, place(other)) * velocity(other)
         total = derivative(kinetic, q) - convective - derivative(energies.potential, q)
         total = total - derivative(energies.dissipation, v) + energies.applied.get(name, Expr({}))
-        force.append(collect(total))
+        force.append(apply_identities(total))
     collected = dataclasses.replace(energies, kinetic=kinetic)
     return EquationsOfMotion(tuple(names), len(free), mass, linear, tuple(force), collected)
 

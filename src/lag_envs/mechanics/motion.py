@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 from lag_envs.mechanics import recording
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative, substitute
 from lag_envs.mechanics.equations import Energies, EquationsOfMotion, derive, place, velocity
 from lag_envs.mechanics.layout import Prescribed, SceneLayout
 from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
@@ -112,7 +112,7 @@ class Mechanics:
     def gyroscopic(self) -> tuple[Expr, Expr] | None:
         """T₁ and T₀, the parts of T of degree one and zero in the velocities, or None."""
         parts: list[dict] = [{}, {}]
-        for monomial, c in collect(self.record.energies.kinetic).terms.items():
+        for monomial, c in apply_identities(self.record.energies.kinetic).terms.items():
             degree = sum(n for atom, n in monomial if atom.kind == "velocity")
             if degree < 2:
                 parts[1 - degree][monomial] = c

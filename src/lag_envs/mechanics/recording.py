@@ -201,7 +201,7 @@ def check_signature(scene: Any, name: str) -> None:
         )
 
 
-def single(value: Any, what: str = "") -> Expr:
+def single_expression(value: Any, what: str = "") -> Expr:
     """Return a formula's result as an expression, or raise a FormulaError."""
     if value is None:
         raise FormulaError(f"{what}returns None; end it with a return of a number")
@@ -215,7 +215,7 @@ def single(value: Any, what: str = "") -> Expr:
         raise FormulaError(f"{what}returns {value!r:.60}, which is not a real number") from None
 
 
-def record(scene: Any, layout: SceneLayout) -> Record:
+def record_scene(scene: Any, layout: SceneLayout) -> Record:
     """Run all formulas of a scene on symbols.
 
     Raises
@@ -242,7 +242,7 @@ def record(scene: Any, layout: SceneLayout) -> Record:
     parts = {}
     for name in ("kinetic", "potential", "dissipation"):
         with formula(scene, name):
-            parts[name] = single(run(name))
+            parts[name] = single_expression(run(name))
     with formula(scene, "applied"):
         applied = _by_name(run("applied"), names, "coordinate")
     with formula(scene, "rests"):
@@ -259,7 +259,7 @@ def record(scene: Any, layout: SceneLayout) -> Record:
 
 def check_again(scene: Any, layout: SceneLayout, found: Record) -> None:
     """Raise a FormulaError if a formula gives another result when it is run again."""
-    again = record(scene, layout).exprs()
+    again = record_scene(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
         raise FormulaError(
             f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend on "
@@ -277,7 +277,7 @@ def _by_name(values: Any, names: Sequence[str], what: str) -> dict[str, Expr]:
     for name in values:
         if name not in names:
             raise FormulaError(f"there is no {what} {name!r}, only {', '.join(names) or 'none at all'}")
-    return {name: single(values[name], f"for {name!r} it ") for name in names if name in values}
+    return {name: single_expression(values[name], f"for {name!r} it ") for name in names if name in values}
 
 
 def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
@@ -287,7 +287,7 @@ def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
     for body, pose in values.items():
         if not isinstance(pose, Sequence) or len(pose) != 3:
             raise FormulaError(f"the pose of {body!r} must be (x, y, angle), got {pose!r:.60}")
-        x, y, angle = (single(value, f"for {body!r} it ") for value in pose)
+        x, y, angle = (single_expression(value, f"for {body!r} it ") for value in pose)
         poses[body] = x, y, angle
     return poses
 

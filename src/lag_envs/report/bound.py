@@ -38,11 +38,13 @@ def jobs(quick: bool) -> list[ReportJob]:
 
     parts, size = (2, 6) if quick else (6, 30)
     found = [
-        ReportJob(SECTION, f"random drives {i + 1}", "bound:points", {"n": size, "seed": i})
+        ReportJob(SECTION, f"random drives {i + 1}", "bound:bound_points", {"n": size, "seed": i})
         for i in range(parts)
     ]
     found += [
-        ReportJob(SECTION, f"substeps {i + 1}", "bound:cost", {"n": 12 if quick else 50, "seed": i})
+        ReportJob(
+            SECTION, f"substeps {i + 1}", "bound:substeps_needed", {"n": 12 if quick else 50, "seed": i}
+        )
         for i in range(1 if quick else 6)
     ]
     names = [name for name, task in TASKS.items() if task().certified_speed() is not None]
@@ -134,7 +136,7 @@ def majorant(x: float, h: float, order: int) -> tuple[float, float]:
     return tail / (order + 2), tail / h
 
 
-def points(n: int, seed: int) -> Iterator[Row]:
+def bound_points(n: int, seed: int) -> Iterator[Row]:
     """Yield bound and truncation error of one step, at every order, for n random drives."""
     for i in range(n):
         rng = np.random.default_rng([seed, i])
@@ -148,7 +150,7 @@ def points(n: int, seed: int) -> Iterator[Row]:
             yield row | {"theta_dot_bound": bounds[1], "theta_dot": actual[1]}
 
 
-def cost(n: int, seed: int) -> Iterator[Row]:
+def substeps_needed(n: int, seed: int) -> Iterator[Row]:
     """Yield, for steps of any length, the substeps that the bound requires and the fewest that suffice."""
     for i in range(n):
         rng = np.random.default_rng([9, seed, i])
@@ -157,7 +159,7 @@ def cost(n: int, seed: int) -> Iterator[Row]:
         while (chosen := pendulum.truncation_bound(omega, drive, h).substeps) > MOST_SUBSTEPS:
             h /= 2.0
         scene, control = driven(drive)
-        exact = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
+        exact = reference.exact_flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
         field = math.sqrt(math.hypot(drive.alpha, drive.beta))
         limits = (
             TOLERANCE * max(1.0, abs(theta), abs(omega) * h),
@@ -188,7 +190,7 @@ def _enough(
     for i in range(n):
         theta, omega, c, s = y
         y = pendulum.step(theta, omega, c, s, drive._replace(delta=drive.delta + drive.ramp * (i * h)), h)
-    return all(abs(e) <= m for e, m in zip(reference.errors(y[:2], exact), limits, strict=True))
+    return all(abs(e) <= m for e, m in zip(reference.differences(y[:2], exact), limits, strict=True))
 
 
 def environment(id: str, n: int) -> Iterator[Row]:

@@ -97,7 +97,7 @@ def marks(steps: int) -> NDArray[np.int64]:
     return np.unique(np.round(np.geomspace(1, steps, count)).astype(np.int64))
 
 
-def march(scene: Stepped) -> Callable:
+def compile_march(scene: Stepped) -> Callable:
     """Compile ``march(out, marks, dt, x, constants...)`` for a scene without control.
 
     Row j of `out` is the lifted state after ``marks[j]`` steps, row -1 the start; it returns the number of
@@ -122,7 +122,7 @@ def march(scene: Stepped) -> Callable:
     return compile_function("march", "\n    ".join(lines) + "\n", code.compile())
 
 
-def run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
+def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the lifted states after these numbers of steps; fewer rows if a step was refused."""
     stepped = Stepped(problem.scene, dt=problem.dt)
     largest = stepped.largest_majorant(problem.dt)
@@ -130,7 +130,7 @@ def run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArray[np.f
         stepped = Stepped(problem.scene, comparison(method, stepped.flow))
     out = np.empty((len(at) + 1, stepped.width))
     out[-1] = stepped.lift(np.array(problem.state))
-    filled = march(stepped)(out, at, problem.dt, largest, *stepped.present())
+    filled = compile_march(stepped)(out, at, problem.dt, largest, *stepped.present())
     return out[:filled]
 
 
@@ -139,7 +139,7 @@ def free(name: str, method: str, steps: int) -> Iterator[Row]:
     problem = FREE[name]
     scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
-    states = run(problem, method, at)
+    states = lifted_run(problem, method, at)
     at = at[: len(states)]
     row: Row = {"kind": "drift", "name": name, "method": method, "steps": at.tolist(), "dt": problem.dt}
     start = scene.energy(problem.state, 0.0)
@@ -172,13 +172,13 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
     errors, amplified = [], []
     for n, state in zip(at, states, strict=True):
         exact = reference.remembered(scene, start, 0.0, float(n) * dt)
-        errors.append(abs(reference.errors(state[:1], exact[:1])[0]))
+        errors.append(abs(reference.differences(state[:1], exact[:1])[0]))
         with mp.workdps(60):
             total = mpf(0)
             for j, value in enumerate(start):
                 moved = [mpf(x) for x in start]
                 moved[j] += EPS * mpf(max(abs(value), 1.0))
-                total += abs(reference.flow(scene, moved, 0.0, float(n) * dt)[0] - exact[0])
+                total += abs(reference.exact_flow(scene, moved, 0.0, float(n) * dt)[0] - exact[0])
         amplified.append(float(total))
     return {
         "kind": "growth", "name": name, "seconds": [float(n) * dt for n in at],
@@ -186,7 +186,7 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
     }  # fmt: skip
 
 
-def balance(variant: str, steps: int) -> Iterator[Row]:
+def energy_imbalance(variant: str, steps: int) -> Iterator[Row]:
     """Yield the imbalance of energy, work and loss over a run with random controls."""
     about = VARIANTS[variant]
     scene = about.scene()

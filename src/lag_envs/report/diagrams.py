@@ -41,7 +41,7 @@ ROUNDED = "amplified rounding"
 LOWEST = 1e-17
 
 
-def draw(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapping[tuple, float]) -> Figure:
+def draw_variant(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapping[tuple, float]) -> Figure:
     """Draw one variant: horizons side by side, alone above, a batch below."""
     from matplotlib.figure import Figure
 

@@ -21,7 +21,7 @@ from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.report import overview, page
 from lag_envs.report.content import ReportFigure, Table
 from lag_envs.report.report import FILE, content_of
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
 
 FIGURES = "images/accuracy"
@@ -31,7 +31,7 @@ OVERVIEW = ReportFigure(
     "overview",
     "Error against run time. The shortest time of one control step in which each method reaches an error, "
     "with only the state, not in a batch. Rivals get their fastest form.",
-    lambda: overview.draw({}),
+    lambda: overview.draw_overview({}),
     raster=True,
 )
 
@@ -137,8 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for old in figures.iterdir():
         old.unlink()
     contents = content_of(found)
-    files = {p.name: drawn(p, figures).name for content in contents.values() for p in content.pictures}
-    write(docs / "accuracy.json", json.dumps(compact(found, files), indent=1, allow_nan=False) + "\n")
+    files = {p.name: drawn_figure(p, figures).name for content in contents.values() for p in content.pictures}
+    write_file(docs / "accuracy.json", json.dumps(compact(found, files), indent=1, allow_nan=False) + "\n")
     update(args.project)
     return 0
 
@@ -146,9 +146,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def update(project: Path) -> None:
     """Write the files that depend on ``docs/accuracy.json`` and ``docs/speed.json``: pages, first figure."""
     for path, text in generated(project).items():
-        write(path, text)
+        write_file(path, text)
     accuracy = json.loads((project / "docs" / "accuracy.json").read_text(encoding="utf-8"))
-    page.draw(replace(OVERVIEW, draw=lambda: overview.draw(accuracy)), project / "docs" / FIGURES)
+    page.write_figure(
+        replace(OVERVIEW, draw=lambda: overview.draw_overview(accuracy)), project / "docs" / FIGURES
+    )
 
 
 def generated(project: Path) -> dict[Path, str]:
@@ -157,17 +159,17 @@ def generated(project: Path) -> dict[Path, str]:
         json.loads((project / "docs" / name).read_text(encoding="utf-8"))
         for name in ("accuracy.json", "speed.json")
     )
-    pages = {"accuracy.md": markdown(accuracy), DETAILS: details(accuracy)}
+    pages = {"accuracy.md": accuracy_markdown(accuracy), DETAILS: details(accuracy)}
     return {project / "docs" / name: text for name, text in pages.items()} | speed_texts(speed, project)
 
 
-def drawn(picture: ReportFigure, folder: Path) -> Path:
+def drawn_figure(picture: ReportFigure, folder: Path) -> Path:
     """Draw a figure; one that is too large as SVG becomes PNG."""
-    path = page.draw(picture, folder)
+    path = page.write_figure(picture, folder)
     if picture.raster or path.stat().st_size <= LARGEST_SVG:
         return path
     path.unlink()
-    return page.draw(replace(picture, raster=True), folder)
+    return page.write_figure(replace(picture, raster=True), folder)
 
 
 def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
@@ -196,7 +198,7 @@ def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
 # --- texts ---
 
 
-def markdown(accuracy: dict[str, Any]) -> str:
+def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     """Return docs/accuracy.md, the page to read."""
     sections = {section["name"]: section for section in accuracy["sections"]}
     claims = [claim for section in accuracy["sections"] for claim in section["claims"]]
@@ -213,7 +215,7 @@ def markdown(accuracy: dict[str, Any]) -> str:
         "",
         "The main results:",
         "",
-        *(f"- {text}" for text in (*FIRST, *overview.findings(accuracy))),
+        *(f"- {text}" for text in (*FIRST, *overview.overview_sentences(accuracy))),
         "",
         *_command("work_precision,general"),
         "## What is promised",
@@ -313,7 +315,7 @@ def _about(accuracy: dict[str, Any]) -> list[str]:
     machine = accuracy["machine"]
     return [
         f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']};"
-        f" {accuracy['settings']['date']}; {page.cell(accuracy['job_seconds'])} s of work.",
+        f" {accuracy['settings']['date']}; {page.cell_text(accuracy['job_seconds'])} s of work.",
         "",
         ", ".join(f"{name} {number}" for name, number in accuracy["versions"].items()) + ".",
     ]
@@ -326,7 +328,9 @@ def _anchor(title: str) -> str:
 
 def _table(table: dict[str, Any] | Table) -> str:
     parts = vars(table) if isinstance(table, Table) else table
-    return markdown_table(parts["columns"], [[page.cell(value) for value in row] for row in parts["rows"]])
+    return markdown_table(
+        parts["columns"], [[page.cell_text(value) for value in row] for row in parts["rows"]]
+    )
 
 
 if __name__ == "__main__":

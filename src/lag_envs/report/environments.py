@@ -21,21 +21,21 @@ from lag_envs.report.environment_results import COMPARED, LONG, RELEASED, conten
 from lag_envs.report.episodes import (
     DIGITS,
     RecordedEpisode,
-    compare,
-    entries,
-    moved,
-    play,
-    random_actions,
-    replay,
-    stepping,
+    endless_actions,
+    entry_errors,
+    episode_errors,
+    exact_states,
+    exact_stepping,
+    moved_start,
+    record_episode,
 )
-from lag_envs.report.gymnasium_peers import PEERS, measure, random_episode, watch
+from lag_envs.report.gymnasium_peers import PEERS, measure_peer, random_episode, record_peer
 from lag_envs.report.runner import ReportJob, Row
 from lag_envs.scenes.derivation import order_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.pivoted_bar import SwingUpFree
 
-__all__ = ["content", "jobs", "ours", "theirs", "undriven"]
+__all__ = ["content", "jobs", "own_episode", "peer_episode", "undriven"]
 
 SECTION = "environments"
 #: Longest episode in control steps: each is followed several times to more than 30 digits.
@@ -48,7 +48,7 @@ def jobs(quick: bool) -> list[ReportJob]:
     seconds = 1.0 if quick else None
     made = [
         ReportJob(
-            SECTION, f"{id}, seed {seed}", "environments:ours",
+            SECTION, f"{id}, seed {seed}", "environments:own_episode",
             {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())}, timeout=600.0,
         )
         for id, kind in TASKS.items()
@@ -57,7 +57,10 @@ def jobs(quick: bool) -> list[ReportJob]:
     ]  # fmt: skip
     made += [
         ReportJob(
-            SECTION, f"{id}, seed {seed}", "environments:theirs", {"id": id, "seed": seed, "seconds": seconds}
+            SECTION,
+            f"{id}, seed {seed}",
+            "environments:peer_episode",
+            {"id": id, "seed": seed, "seconds": seconds},
         )
         for id in PEERS
         for seed in (seeds[:3] if id == "Acrobot-v1" else seeds)  # its episodes last 100 s
@@ -80,12 +83,12 @@ def longest(task: Task) -> float | None:
 # --- what is measured ---
 
 
-def ours(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
+def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
     """Yield one row: an episode of our environment against the exact one."""
     options: dict[str, Any] = {} if duration is None else {"duration": duration}
     env = gym.make(id, disable_env_checker=True, **options)
     env.reset(seed=seed)
-    episode = play(env, random_actions(env, seed))
+    episode = record_episode(env, endless_actions(env, seed))
     row = against_exact(env.unwrapped.task, episode, seed, vouch=seed == 0)  # type: ignore[attr-defined]
     yield row | {"case": id, "seed": seed}
 
@@ -94,11 +97,11 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
     """Return the row of an episode of ours; if asked, computed twice, with the difference of the two."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
-        return replay(task, seed, start, episode.controls, digits)
+        return exact_states(task, seed, start, episode.controls, digits)
 
-    path, step = exact(episode.states[0]), stepping(task, seed, DIGITS)
+    path, step = exact(episode.states[0]), exact_stepping(task, seed, DIGITS)
     alone = [step(y, i, u) for i, (y, u) in enumerate(zip(episode.states, episode.controls, strict=False), 1)]
-    row = compare(episode, path, exact(moved(episode.states), DIGITS - 10), alone, task.dt)
+    row = episode_errors(episode, path, exact(moved_start(episode.states), DIGITS - 10), alone, task.dt)
     if vouch:
         row["disagreement"] = float(
             max(
@@ -111,12 +114,12 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
     row |= {
         "ours": True,
         "integrator": f"Taylor series, order {order}" if order else "exact flow",
-        "entries": entries(row.pop("each"), task.scene.state_names, task.scene.state_units),
+        "entries": entry_errors(row.pop("each"), task.scene.state_names, task.scene.state_units),
     }
     return row
 
 
-def theirs(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
+def peer_episode(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
     """Yield rows of one of Gymnasium's environments under random actions.
 
     CartPole-v1 falls within half a second; a second row goes on to 10 s, by its own update, as if it had not
@@ -129,7 +132,7 @@ def theirs(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
         cases["CartPole-v1, past its end"] = False
     for case, to_the_end in cases.items():
         env, episode, used = random_episode(id, seed, steps, to_the_end)
-        yield measure(env, PEERS[id], episode) | {"case": case, "seed": used}
+        yield measure_peer(env, PEERS[id], episode) | {"case": case, "seed": used}
 
 
 # --- the undriven pendulum ---
@@ -159,9 +162,9 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
     if not id:
         env: Any = gym.make(SwingUpFree.id, disable_env_checker=True, **TWIN, dt=dt)
         env.reset(seed=0, options={"state": [RELEASED, 0.0]})
-        episode = play(env, itertools.repeat(np.zeros(1, np.float32)))
+        episode = record_episode(env, itertools.repeat(np.zeros(1, np.float32)))
         scene = env.unwrapped.scene
-        row = against_exact(env.unwrapped.task, first(episode, dt), seed=0)
+        row = against_exact(env.unwrapped.task, compared_part(episode, dt), seed=0)
         energy = scene.energy(episode.states)["total"] - scene.energy([0.0, 0.0])["total"]
         case = f"{SwingUpFree.id} with Pendulum-v1's equation, undriven"
     else:
@@ -171,8 +174,8 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
         vars(env).update(changes)
         env.state = np.array([*[0.0] * (len(peer.order) - 2), math.pi - RELEASED, 0.0])
         dt = peer.step(env)
-        episode = watch(env, peer, itertools.repeat(action), round(LONG / dt), to_the_end=False)
-        row = measure(env, peer, first(episode, dt))
+        episode = record_peer(env, peer, itertools.repeat(action), round(LONG / dt), to_the_end=False)
+        row = measure_peer(env, peer, compared_part(episode, dt))
         hanging = [*[0.0] * (len(peer.order) - 2), math.pi, 0.0]
         scene = peer.scene(env)
         energy = scene.energy(episode.states)["total"] - scene.energy(hanging)["total"]
@@ -180,7 +183,7 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
     yield row | {"case": case, "seed": None, "gain": float(energy[-1] / energy[0] - 1.0)}
 
 
-def first(episode: RecordedEpisode, dt: float) -> RecordedEpisode:
+def compared_part(episode: RecordedEpisode, dt: float) -> RecordedEpisode:
     """Return the part of an undriven episode that is compared."""
     steps = round(COMPARED / dt)
     return RecordedEpisode(episode.states[: steps + 1], episode.controls[:steps], False)

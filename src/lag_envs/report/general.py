@@ -24,14 +24,14 @@ from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
 from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
-from lag_envs.report.reference import ends
+from lag_envs.report.reference import exact_ends
 from lag_envs.report.rivals import CompiledMethod, Rival
-from lag_envs.report.runner import ReportJob, Row, describe
+from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.timing import Sample, interleaved
 from lag_envs.scenes.derivation import order_of
 from lag_envs.stepping.general import series_code_of
 
-__all__ = ["certified", "content", "errors", "jobs", "measured", "shares"]
+__all__ = ["attempts_and_bounds", "content", "jobs", "shares", "timed_rivals", "worst_and_median"]
 
 SECTION = "general"
 #: Copies of the states in a timed call; our tolerances and orders.
@@ -106,10 +106,10 @@ def jobs(quick: bool) -> list[ReportJob]:
     return made
 
 
-def exact(name: str, count: int) -> Iterator[Row]:
+def exact_ends_of_systems(name: str, count: int) -> Iterator[Row]:
     """Compute the exact end states, which are kept for the other jobs."""
     system = SYSTEMS[name]
-    high, _ = ends(system.scene, *system.draw(count), DT)
+    high, _ = exact_ends(system.scene, *system.draw(count), DT)
     yield {"kind": "exact", "system": name, "states": len(high)}
 
 
@@ -119,7 +119,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
     try:
         mass, acceleration = differences(SYSTEMS[name], engine)
     except ImportError as error:
-        yield about | {"problem": describe(error)}
+        yield about | {"problem": error_line(error)}
     else:
         yield about | {"mass": mass, "acceleration": acceleration}
 
@@ -127,7 +127,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
 # --- error against time ---
 
 
-def rivals(family: str, quick: bool) -> list[Rival]:
+def system_rivals(family: str, quick: bool) -> list[Rival]:
     """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
     some: slice = slice(-1, None, -5) if quick else slice(None)
     if family == "heyoka":
@@ -149,23 +149,23 @@ def rivals(family: str, quick: bool) -> list[Rival]:
     ]
 
 
-def points(name: str, family: str, quick: bool) -> Iterator[Row]:
+def system_points(name: str, family: str, quick: bool) -> Iterator[Row]:
     """Yield worst error and time of a family's settings on a system, alone and in a batch."""
     system, count = SYSTEMS[name], 8 if quick else MEMBERS
     starts, controls = system.draw(count)
-    truth = ends(system.scene, starts, controls, DT)
+    truth = exact_ends(system.scene, starts, controls, DT)
     copies = 1 if family in ENGINES else COPIES
     problems = SceneProblems(
         system.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)), system
     )
     clock = CertifiedSeries(CertifiedSeries.method_of(CLOCK[1]), CLOCK[0])
     for mode in MODES:
-        yield from measured(
-            problems, truth, rivals(family, quick), clock, mode, 3 if quick else 9, {"system": name}
+        yield from timed_rivals(
+            problems, truth, system_rivals(family, quick), clock, mode, 3 if quick else 9, {"system": name}
         )
 
 
-def measured(
+def timed_rivals(
     problems: SceneProblems,
     truth: tuple[Array, Array],
     some: Sequence[Rival],
@@ -188,9 +188,9 @@ def measured(
         }  # fmt: skip
         try:
             sample = rival.build(problems, dt, 1, together)
-            worst, typical = errors(sample.end(), truth)
+            worst, typical = worst_and_median(sample.end(), truth)
         except Exception as error:
-            yield row | {"problem": describe(error)}
+            yield row | {"problem": error_line(error)}
             if isinstance(error, ImportError):
                 return
         else:
@@ -202,7 +202,7 @@ def measured(
         yield row | {"ns": times[i + 1], "clock": times[0]}
 
 
-def errors(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:
+def worst_and_median(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:
     """Return the worst and median error over states, of the largest entry relative to max(1, |entry|)."""
     high, low = truth
     some = found[: len(high)]
@@ -236,11 +236,13 @@ def certificate(name: str, count: int) -> Iterator[Row]:
     system = SYSTEMS[name]
     for dt in LENGTHS:
         for order in CERTIFIED_ORDERS:
-            attempts = certified(system.scene, *system.draw(count, seed=2), dt, order)[0]
+            attempts = attempts_and_bounds(system.scene, *system.draw(count, seed=2), dt, order)[0]
             yield {"kind": "certificate", "system": name, "dt": dt, "order": order, **shares(attempts)}
 
 
-def certified(scene: Any, states: Array, controls: Array, dt: float, order: int) -> tuple[list[int], Array]:
+def attempts_and_bounds(
+    scene: Any, states: Array, controls: Array, dt: float, order: int
+) -> tuple[list[int], Array]:
     """Return each step's attempts, not positive if it was refused, and the largest bound of any step."""
     code, numbers = series_code_of(scene)
     attempts, bounds = [], []
@@ -261,7 +263,7 @@ def shares(attempts: Sequence[int]) -> Row:
     }
 
 
-def first(name: str, rounds: int) -> Iterator[Row]:
+def first_step_seconds(name: str, rounds: int) -> Iterator[Row]:
     """Yield the seconds until the first step: ours with an empty and a filled cache, heyoka's compilation."""
     system = SYSTEMS[name]
     state, control = (x[0].tolist() for x in system.draw(1))
@@ -283,7 +285,7 @@ def first(name: str, rounds: int) -> Iterator[Row]:
                 "seconds": _heyoka(system, mode),
             }
         except ImportError as error:
-            yield {"kind": "first", "system": name, "what": f"heyoka, {mode}", "problem": describe(error)}
+            yield {"kind": "first", "system": name, "what": f"heyoka, {mode}", "problem": error_line(error)}
             return
 
 

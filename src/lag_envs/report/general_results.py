@@ -39,14 +39,14 @@ class BestSetting(NamedTuple):
     label: str
 
 
-def label(row: Row) -> str:
+def setting_label(row: Row) -> str:
     """Return a setting in words."""
     if row["family"] in ("ours", "heyoka"):
         return f"{row['method'].removeprefix('lag_envs, ')}, {row['setting']:g}"
     return f"{row['method']}, {row['setting']:g} substep{'s' if row['setting'] > 1 else ''}"
 
 
-def column(row: Row) -> str:
+def column_name(row: Row) -> str:
     """Return a point's column: compiled methods have one each."""
     if row["family"] == "ours":
         return "lag_envs"
@@ -66,7 +66,7 @@ OTHERS = (
 COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
 
 
-def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, BestSetting]]:
+def best_settings(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, BestSetting]]:
     """Return, by system, mode and error, the quickest setting of each column.
 
     Times are in units of ours in one job, by the clock of every job. A method without a batch counts there as
@@ -85,29 +85,29 @@ def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, BestSett
                 continue
             for target in TARGETS:
                 here = found.setdefault((r["system"], mode, target), {})
-                if r["error"] <= target and not (column(r) in here and here[column(r)].ns <= ns):
-                    here[column(r)] = BestSetting(ns, label(r))
+                if r["error"] <= target and not (column_name(r) in here and here[column_name(r)].ns <= ns):
+                    here[column_name(r)] = BestSetting(ns, setting_label(r))
     return found
 
 
 def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content: times at equal errors, equality of models, certificates, first steps, energy."""
-    found = best(rows)
+    found = best_settings(rows)
     missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
     fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
     claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
     pictures = [
         ReportFigure(
-            f"general-{slug(name)}",
+            f"general-{file_part(name)}",
             f"Error against time, {name}. One control step of {DT:g} s from {MEMBERS} harsh states: worst "
             "error, and CPU time of a state's step; reference: Lagrange's equations by SymPy, Taylor "
             "series in python-flint's balls.",
-            partial(draw, name, [r for r in rows if r["kind"] == "point" and r["system"] == name]),
+            partial(draw_times, name, [r for r in rows if r["kind"] == "point" and r["system"] == name]),
         )
         for name in SYSTEMS
         if any(r["kind"] == "point" and r["system"] == name for r in rows)
     ]
-    tables = [times(found, mode) for mode in MODES]
+    tables = [best_times(found, mode) for mode in MODES]
     tables += [_models(rows), _shares(rows), _first(rows), _energy(rows)]
     return Content(
         "Any Lagrangian",
@@ -139,7 +139,7 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     )
 
 
-def slug(name: str) -> str:
+def file_part(name: str) -> str:
     """Return a system's name as part of a file's."""
     return name.replace(",", "").replace(" ", "-")
 
@@ -173,7 +173,7 @@ def _others(here: Mapping[str, BestSetting]) -> list[tuple[float, str]]:
     return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
 
 
-def times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
+def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
     """Return the quickest setting of each column, by system and error."""
     rows = []
     for (system, of, target), here in found.items():
@@ -358,7 +358,7 @@ STYLES = {
 }
 
 
-def draw(name: str, rows: Sequence[Row]) -> Figure:
+def draw_times(name: str, rows: Sequence[Row]) -> Figure:
     """Draw worst errors against times: of each column the settings that none of its others beats."""
     from matplotlib.figure import Figure
 
@@ -374,7 +374,7 @@ def draw(name: str, rows: Sequence[Row]) -> Figure:
             some = [
                 (r["ns"], r["error"])
                 for r in rows
-                if column(r) == title
+                if column_name(r) == title
                 and (r["mode"] == mode or not r["batched"])
                 and r.get("error") is not None
             ]

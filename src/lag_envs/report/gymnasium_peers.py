@@ -13,7 +13,14 @@ import gymnasium as gym
 import numpy as np
 from mpmath import mpf
 
-from lag_envs.report.episodes import DIGITS, RecordedEpisode, compare, entries, moved, random_actions
+from lag_envs.report.episodes import (
+    DIGITS,
+    RecordedEpisode,
+    endless_actions,
+    entry_errors,
+    episode_errors,
+    moved_start,
+)
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Row
 from lag_envs.scenes import Acrobot, CartPole, Pendulum
@@ -71,7 +78,7 @@ PEERS = {
 }  # fmt: skip
 
 
-def watch(
+def record_peer(
     env: Any, peer: GymnasiumPeer, actions: Iterator[Any], steps: int, to_the_end: bool
 ) -> RecordedEpisode:
     """Record at most so many steps of a peer that has been reset; until its termination, or past it."""
@@ -92,28 +99,32 @@ def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[An
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     while True:
         env.reset(seed=seed)
-        episode = watch(env, peer, random_actions(env, seed), steps, to_the_end)
+        episode = record_peer(env, peer, endless_actions(env, seed), steps, to_the_end)
         limits = peer.limits(env)
         if not limits or (np.abs(episode.states[:, -len(limits) :]) < limits).all():
             return env, episode, seed
         seed += 1000
 
 
-def measure(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row:
+def measure_peer(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row:
     """Return the row of a peer's episode against the exact one."""
     dt = peer.step(env)
-    path = solve(env, peer, episode.states[0], episode.controls)
-    shifted = solve(env, peer, moved(episode.states), episode.controls)
-    alone = [solve(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)]
-    row = compare(episode, path, shifted, alone, dt, peer.wraps)
+    path = solve_peer(env, peer, episode.states[0], episode.controls)
+    shifted = solve_peer(env, peer, moved_start(episode.states), episode.controls)
+    alone = [
+        solve_peer(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)
+    ]
+    row = episode_errors(episode, path, shifted, alone, dt, peer.wraps)
     return row | {
         "ours": False,
         "integrator": peer.integrator,
-        "entries": entries(row.pop("each"), *peer.described(env)),
+        "entries": entry_errors(row.pop("each"), *peer.described(env)),
     }
 
 
-def solve(env: Any, peer: GymnasiumPeer, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
+def solve_peer(
+    env: Any, peer: GymnasiumPeer, start: Sequence[Any], controls: Sequence[float]
+) -> list[list[mpf]]:
     """Return the exact states of a peer's equations of motion, each control held for one step."""
     oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
     path = [[x if isinstance(x, mpf) else mpf(float(x)) for x in (start[i] for i in peer.order)]]

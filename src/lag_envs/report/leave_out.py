@@ -96,10 +96,10 @@ def terms() -> Iterator[Row]:
     """Yield the contents of the compiled step of every environment with a dedicated flow."""
     for id, task in TASKS.items():
         if form_of(task().scene) is not None:
-            yield {"kind": "terms", "id": id} | carried(task())
+            yield {"kind": "terms", "id": id} | carried_numbers(task())
 
 
-def carried(task: Task) -> Row:
+def carried_numbers(task: Task) -> Row:
     """Return state, terms, stages and constants of a task's compiled step, and those that nothing uses."""
     scene = task.scene
     numbers = constants_of(task)
@@ -123,11 +123,11 @@ def carried(task: Task) -> Row:
         "zero": sorted(absent),
         "operations": code.operations,
         "unused": [name.removeprefix("k_") for name in given if name not in needed],
-        "idle": [name for line in lines for name in made(line) if name not in needed],
+        "idle": [name for line in lines for name in assigned(line) if name not in needed],
     }
 
 
-def made(line: str) -> list[str]:
+def assigned(line: str) -> list[str]:
     """Return the names that a line of code assigns.
 
     Examples
@@ -151,8 +151,8 @@ def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
     """
     needed = set(results)
     for line in reversed(lines):
-        if needed & set(made(line)) or not made(line):
-            needed |= set(re.findall(r"[A-Za-z_]\w*", line.partition("=")[2] if made(line) else line))
+        if needed & set(assigned(line)) or not assigned(line):
+            needed |= set(re.findall(r"[A-Za-z_]\w*", line.partition("=")[2] if assigned(line) else line))
     return needed
 
 

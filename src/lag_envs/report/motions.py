@@ -15,7 +15,7 @@ from lag_envs.mechanics.algebra import Atom, Expr, evaluate, substitute
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter, parameter_values
 from lag_envs.report.equations import Equation, Problems
-from lag_envs.report.oracle import oracle_of, solve
+from lag_envs.report.oracle import oracle_of, solve_positive
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import BLOCK, Sample
 from lag_envs.scenes.base import Scene
@@ -95,7 +95,7 @@ class SceneEquation(Equation):
         mass, force = self._motion
         found = evaluate([*mass, *force], values, xp)
         rows = [found[i * n : (i + 1) * n] for i in range(n)]
-        return *y[n : 2 * n], *solve(rows, found[n * n :])
+        return *y[n : 2 * n], *solve_positive(rows, found[n * n :])
 
 
 class SceneProblems(Problems):

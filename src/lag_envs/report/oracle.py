@@ -182,7 +182,7 @@ BALLS = SimpleNamespace(
 )
 
 
-def solve(rows: Sequence[Sequence], right: Sequence) -> list:
+def solve_positive(rows: Sequence[Sequence], right: Sequence) -> list:
     """Return the solution of a small positive system, by elimination on numbers of any kind."""
     n = len(right)
     table = [[*row, b] for row, b in zip(rows, right, strict=True)]
@@ -203,7 +203,7 @@ def _ball(x: Any) -> Any:
     return x if isinstance(x, flint.arb) else flint.arb(x if isinstance(x, mpf) else float(x))
 
 
-def number(ball: Any) -> mpf:
+def midpoint(ball: Any) -> mpf:
     """Return a ball's midpoint as an mpmath number, without rounding."""
     mantissa, exponent = ball.mid().man_exp()
     with mp.workprec(int(mantissa).bit_length() + 1):
@@ -337,7 +337,7 @@ class Oracle:
         """Return mass matrix and accelerations at a state without held rates, in floats."""
         mass, force, _ = self.terms(*self.start(state, controls, float), controls)
         matrix = np.array(mass, dtype=np.float64)
-        return matrix, np.array(solve(matrix.tolist(), force), dtype=np.float64)
+        return matrix, np.array(solve_positive(matrix.tolist(), force), dtype=np.float64)
 
     def start(self, state: Sequence, controls: Sequence, make: Callable) -> tuple[dict, dict]:
         """Return places and velocities of all coordinates; w replaces the velocity if a rate is held."""
@@ -357,7 +357,7 @@ class Oracle:
         """Return M⁻¹ G ṡ, by which w exceeds the velocities if rates ṡ are held."""
         mass, _, coupling = self.terms(q, v, u, xp, bits)
         rates = [v[name] for name in self.equations.rates]
-        return solve(mass, [sum(g * s for g, s in zip(row, rates, strict=True)) for row in coupling])
+        return solve_positive(mass, [sum(g * s for g, s in zip(row, rates, strict=True)) for row in coupling])
 
     # --- exact ---
 
@@ -393,7 +393,7 @@ class Oracle:
         """Return the end state from one computation whose steps keep so many digits."""
         for what, given, names in (
             ("state", state, self.names.state),
-            ("controls", listed(controls), self.names.controls),
+            ("controls", control_list(controls), self.names.controls),
         ):
             if len(given) != len(names):
                 raise ValueError(f"{what} must have {len(names)} entries, got {len(given)}")
@@ -401,7 +401,7 @@ class Oracle:
             plan = Precision(digits, spare)
             with flint.ctx.workprec(plan.bits):
                 try:
-                    return [number(x) for x in self._end(plan, state, controls, dt)]
+                    return [midpoint(x) for x in self._end(plan, state, controls, dt)]
                 except Rounded:
                     if spare == SPARE[-1]:
                         raise
@@ -410,7 +410,7 @@ class Oracle:
         raise AssertionError(SPARE)
 
     def _end(self, plan: Precision, state: Sequence, controls: Any, dt: Any) -> list:
-        u, left = [_ball(x) for x in listed(controls)], _ball(dt)
+        u, left = [_ball(x) for x in control_list(controls)], _ball(dt)
         q, v = self.start([_ball(x) for x in state], u, flint.arb)
         v = self._shifted(plan, q, v, u, -1)
         h, again = left, FIRST_TRY
@@ -466,12 +466,12 @@ class Oracle:
         """
         plan = Precision(digits)
         with flint.ctx.workprec(plan.bits):
-            u = [_ball(x) for x in listed(controls)]
+            u = [_ball(x) for x in control_list(controls)]
             q, v = self.start([_ball(x) for x in state], u, flint.arb)
             v = self._shifted(plan, q, v, u, -1)
             grown = self._coefficients(plan, q, v, u, _ball(h))
             *_, found = itertools.islice(grown, max(1, count - 1))
-            places, rates = ({name: [number(c) for c in of[name][:count]] for name in of} for of in found)
+            places, rates = ({name: [midpoint(c) for c in of[name][:count]] for name in of} for of in found)
             return places, rates
 
     def _coefficients(
@@ -608,7 +608,7 @@ class Oracle:
         return q_end, v_end
 
 
-def listed(controls: Any) -> list:
+def control_list(controls: Any) -> list:
     """Return the controls as a list; a single control may be given as a number."""
     return list(controls) if isinstance(controls, Sequence | np.ndarray) else [controls]
 

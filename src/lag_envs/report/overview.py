@@ -23,7 +23,7 @@ OURS = "lag_envs"
 Points = list[tuple[float, float]]
 
 
-def draw(accuracy: dict[str, Any]) -> Figure:
+def draw_overview(accuracy: dict[str, Any]) -> Figure:
     """Draw the picture.
 
     Parameters
@@ -79,7 +79,7 @@ def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
     return ours, rivals
 
 
-def findings(accuracy: dict[str, Any]) -> list[str]:
+def overview_sentences(accuracy: dict[str, Any]) -> list[str]:
     """Return sentences on how often a rival is faster at an error, and on the time of a general simulator."""
     own = list(_rows(accuracy, "work_precision", "work_precision_targets", horizon="one step"))
     modes = ("general-times-single", "general-times-batch")

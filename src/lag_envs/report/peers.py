@@ -117,7 +117,7 @@ class SciPy(LibraryRival):
         return solve
 
 
-def recorded(equation: Equation) -> tuple[list[str], list]:
+def rate_lines(equation: Equation) -> tuple[list[str], list]:
     """Return the lines of the rate of y0, y1, ... with p0, p1, ... at the time t, and its values."""
     trace = ElementaryTrace()
     names = [f"y{i}" for i in range(equation.size)], [f"p{i}" for i in range(equation.parameters)]
@@ -129,7 +129,7 @@ def recorded(equation: Equation) -> tuple[list[str], list]:
 @cache
 def _rate(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
-    lines, values = recorded(equation)
+    lines, values = rate_lines(equation)
     source = [
         "def rate(t, y, p):",
         *(f"y{i} = y[{i}]" for i in range(equation.size)),
@@ -145,7 +145,7 @@ def _rate(equation: Equation) -> Callable:
 @cache
 def _rate_of_many(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of many states, one after the other in y; p has a row for each parameter."""
-    lines, values = recorded(equation)
+    lines, values = rate_lines(equation)
     size = equation.size
     source = [
         "def rate(t, y, p):",

@@ -25,7 +25,7 @@ import lag_envs
 from lag_envs import store
 from lag_envs.host import machine
 from lag_envs.progress import progress
-from lag_envs.workers import died, outcomes, processes
+from lag_envs.workers import as_they_finish, died, processes
 
 Row = dict[str, Any]
 #: Packages whose versions are recorded.
@@ -113,7 +113,7 @@ def run_jobs(
         False if the user interrupted it.
     """
     file = folder / "results.jsonl"
-    known = {result.key: result for result in load(file) if result.problem is None}
+    known = {result.key: result for result in load_results(file) if result.problem is None}
     todo = [job for job in jobs if job.key not in known]
     if len(todo) < len(jobs):
         tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are reused from before")
@@ -137,7 +137,7 @@ def run_jobs(
     return [known[job.key] for job in jobs if job.key in known], complete
 
 
-def load(file: Path) -> list[JobResult]:
+def load_results(file: Path) -> list[JobResult]:
     """Return the results in a file; a line that was cut off by a kill is skipped."""
     results = []
     for row in store.rows(file):
@@ -155,7 +155,7 @@ def _in_processes(jobs: Sequence[ReportJob], folder: Path, count: int) -> Iterat
         for job in jobs:
             arguments = (job.function, job.arguments, Path(rows) / job.key)
             futures[submit(_work, *arguments, timeout=job.timeout)] = job
-        for job, outcome in outcomes(futures):
+        for job, outcome in as_they_finish(futures):
             if isinstance(outcome, TimeoutError):
                 outcome = f"stopped after {job.timeout:.0f} s", job.timeout
             elif isinstance(outcome, BaseException):
@@ -182,7 +182,7 @@ def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | N
         for row in getattr(module(place), name)(**arguments):
             store.append(rows, row)
     except Exception as error:
-        problem = describe(error)
+        problem = error_line(error)
     return problem, round(time.monotonic() - start, 3)
 
 
@@ -191,7 +191,7 @@ def module(name: str) -> Any:
     return import_module(name if "." in name else f"lag_envs.report.{name}")
 
 
-def describe(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """Return an error as one line; for a missing package, that it is not installed.
 
     Examples

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from lag_envs.report.cases import VARIANTS
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
-from lag_envs.report.diagrams import draw
+from lag_envs.report.diagrams import draw_variant
 from lag_envs.report.points import HORIZONS, LIBRARIES, MODES, WorkPrecisionPoint, gathered
 from lag_envs.report.runner import JobResult, Row
 
@@ -95,10 +95,11 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     variants = [name for name in VARIANTS if any(p.variant == name for p in points)]
     return Content(
         title="Error against time",
-        text=[*_text(rows), *findings(found)],
+        text=[*_text(rows), *horizon_findings(found)],
         tables=[_targets(found), _near(points), _orders(rows), _failed(rows, problems)],
         pictures=[
-            ReportFigure(_file(name), _caption(name), partial(draw, name, points, floor)) for name in variants
+            ReportFigure(_file(name), _caption(name), partial(draw_variant, name, points, floor))
+            for name in variants
         ],
         claims=claims(rows, points, found),
         summary=_summary(points, found),
@@ -141,7 +142,7 @@ def _text(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def findings(found: Sequence[Duel]) -> list[str]:
+def horizon_findings(found: Sequence[Duel]) -> list[str]:
     """Return, for every horizon, a paragraph on who is faster at which error, and by how much."""
     paragraphs = []
     for horizon in HORIZONS:

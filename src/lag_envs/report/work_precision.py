@@ -1,7 +1,7 @@
 """Error against time: the shipped stepping, the usual integrators, other libraries.
 
-Every rival runs in its fastest form (`rivals`, `peers`), alone and in a batch, and the errors are those of
-the timed calls. `verdicts` compares and reports the measurements, `diagrams` draws them.
+Every rival runs in its fastest form (`variant_rivals`, `peers`), alone and in a batch, and the errors are
+those of the timed calls. `verdicts` compares and reports the measurements, `diagrams` draws them.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from lag_envs.report.equations import Array, Problems
 from lag_envs.report.integrators import METHODS, comparison, plain_series
 from lag_envs.report.points import MODES
 from lag_envs.report.rivals import CompiledMethod, Rival, ShippedStepping
-from lag_envs.report.runner import ReportJob, Row, describe
+from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import FlowSteps, Sample, interleaved
 from lag_envs.report.verdicts import ROUNDING, content
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.flows import Flow
 
-__all__ = ["content", "errors", "jobs", "orders", "points"]
+__all__ = ["content", "jobs", "orders", "state_errors", "variant_points"]
 
 SECTION = "work_precision"
 #: Orders of the series whose convergence is measured; orders that are not shipped are used for nothing else.
@@ -141,11 +141,12 @@ class ExactEnd(NamedTuple):
         if not np.isfinite(state).all():
             return math.inf
         return max(
-            abs(e) / s for e, s in zip(reference.errors(state.tolist(), self.end), self.scale, strict=True)
+            abs(e) / s
+            for e, s in zip(reference.differences(state.tolist(), self.end), self.scale, strict=True)
         )
 
 
-def truth(case: Case, dt: float, steps: int) -> ExactEnd:
+def exact_end(case: Case, dt: float, steps: int) -> ExactEnd:
     """Return the exact end; errors of one step are relative to the start's size, later ones to the end's."""
     end = reference.remembered(case.scene, case.state, case.control, dt * steps)
     at = case if steps == 1 else case._replace(state=tuple(map(float, end)))
@@ -156,7 +157,7 @@ def truths(variant: str, horizon: str, plan: Horizon) -> list[ExactEnd]:
     """Return the exact ends of a horizon's members."""
     dt = control_step(variant)
     return [
-        truth(case, dt, plan.steps(dt))
+        exact_end(case, dt, plan.steps(dt))
         for case in problems(variant, horizon, ensemble(variant, plan.members))
     ]
 
@@ -169,7 +170,7 @@ def amplified(some: Sequence[ExactEnd], dt: float, steps: int) -> float:
     for case, end, scale in some:
         with mp.workdps(40):
             state = [mpf(x) * (1 + mpf(ROUNDING)) for x in case.state]
-            moved = reference.flow(case.scene, state, case.control, dt * steps, digits=20)
+            moved = reference.exact_flow(case.scene, state, case.control, dt * steps, digits=20)
             found.append(max(float(abs(a - b)) / s for a, b, s in zip(moved, end, scale, strict=True)))
     return median(found)
 
@@ -185,7 +186,7 @@ def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
     }  # fmt: skip
 
 
-def errors(some: Sequence[ExactEnd], ends: Array) -> Row:
+def state_errors(some: Sequence[ExactEnd], ends: Array) -> Row:
     """Return errors of states, the largest and median of those below 1, and the number of lost members."""
     found = [t.error(end) for t, end in zip(some, ends, strict=True)]
     kept = [error for error in found if error < 1.0]
@@ -201,7 +202,7 @@ def errors(some: Sequence[ExactEnd], ends: Array) -> Row:
 # --- points ---
 
 
-def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
+def variant_rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
     """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
@@ -222,7 +223,7 @@ def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
     return [kind(method, setting) for method, found in kind.settings.items() for setting in found[some]]
 
 
-def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
+def variant_points(variant: str, family: str, quick: bool) -> Iterator[Row]:
     """Yield errors and times of a family on a variant, alone and in a batch.
 
     Every row has as its `clock` our time of a control step, measured in turn with it in the same job.
@@ -237,7 +238,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
             found: list[Row] = []
             samples: list[Sample] = []
             done: dict[str, float] = {}  # error so far of methods; -1 if finer settings are not run
-            for rival in rivals(variant, horizon, family, quick):
+            for rival in variant_rivals(variant, horizon, family, quick):
                 if done.get(rival.method) == -1.0 or (together and not rival.batched):
                     continue
                 about = {
@@ -251,7 +252,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                     yield about | {"problem": str(error)}
                     done[rival.method] = -1.0
                 except Exception as error:
-                    yield about | {"problem": describe(error)}
+                    yield about | {"problem": error_line(error)}
                     if isinstance(error, ImportError):
                         return
                 else:
@@ -287,7 +288,7 @@ def point(
             raise TimeoutError(f"not run, it would take {expected:.0f} s")
     ends = rival.build(Problems(cases), dt, steps, together).end()[: len(some)]
     known = np.where(np.isnan(ends), np.nan, ends)  # NaN has many bit patterns
-    row = errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}
+    row = state_errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}
     return row, timed(rival, base, dt, steps, together)
 
 
@@ -386,16 +387,16 @@ def orders(variant: str, quick: bool) -> Iterator[Row]:
 def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[ExactEnd]]:
     """Return the exact ends of single steps of several lengths, each √2 times the previous one."""
     lengths = [round(VARIANTS[variant].dt * 2 ** (k / 2) * 2**36) / 2**36 for k in range(-4, 9)]
-    return {h: [truth(case, h, 1) for case in cases] for h in lengths}
+    return {h: [exact_end(case, h, 1) for case in cases] for h in lengths}
 
 
 def measured_order(found: OrderedMethod, ends: Mapping[float, Sequence[ExactEnd]]) -> float | None:
     """Return the slope of the error of one step over its length, minus one; None if there is none."""
     kernels = FlowSteps(next(iter(ends.values()))[0].case.scene, found.flow)
-    return slope({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
+    return observed_order({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
 
 
-def slope(found: Mapping[float, Sequence[float]]) -> float | None:
+def observed_order(found: Mapping[float, Sequence[float]]) -> float | None:
     """Return the observed order from the errors of steps of several lengths, as median over members.
 
     The comparison uses the shortest steps h and 2h whose errors are well above rounding in half of the

@@ -28,7 +28,7 @@ from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values, parameter_values
 from lag_envs.scenes import picture, steps
 from lag_envs.scenes.checks import check_both
-from lag_envs.scenes.declaring import ORDER, complete, declare
+from lag_envs.scenes.declaring import ORDER, complete, declare_scene
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.door import admit, check_class
 from lag_envs.scenes.parameters import parameter as parameter
@@ -180,7 +180,7 @@ class Scene(metaclass=SceneType):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        declare(cls, SceneType)
+        declare_scene(cls, SceneType)
 
     _faults: ClassVar[tuple[str, ...]] = ()
 
@@ -207,7 +207,7 @@ class Scene(metaclass=SceneType):
         found = vars(self).get("_cached_mechanics")
         if found is None:
             layout = layout_of(self)
-            found = motion.derive_motion(self, layout, recording.record(self, layout))
+            found = motion.derive_motion(self, layout, recording.record_scene(self, layout))
             vars(self)["_cached_mechanics"] = found
         return found
 
@@ -604,9 +604,9 @@ class Scene(metaclass=SceneType):
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: parameters, state, controls, equations."""
-        from lag_envs.scenes.html import described
+        from lag_envs.scenes.html import scene_html
 
-        return described(self)
+        return scene_html(self)
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""

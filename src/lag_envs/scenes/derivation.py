@@ -54,7 +54,9 @@ def mechanics_with(scene: Scene, parameters: tuple[str, ...]) -> Mechanics:
     known = vars(scene).setdefault("_cached_mechanics_with", {})
     if parameters not in known:
         layout = layout_of(scene)
-        known[parameters] = motion.derive_motion(scene, layout, recording.record(scene, layout), parameters)
+        known[parameters] = motion.derive_motion(
+            scene, layout, recording.record_scene(scene, layout), parameters
+        )
     return known[parameters]
 
 

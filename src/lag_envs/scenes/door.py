@@ -66,7 +66,7 @@ def admit(scene: Any, base: type) -> None:
     elif known is None:
         _check_names(scene, base)
         layout = layout_of(scene)
-        recording.check_again(scene, layout, recording.record(scene, layout))
+        recording.check_again(scene, layout, recording.record_scene(scene, layout))
         _check_motion(scene, scene.mechanics)
         _check_bodies(scene)
         _admitted[type(scene)][key] = layout, scene.mechanics

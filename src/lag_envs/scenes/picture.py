@@ -114,7 +114,7 @@ class Picture:
         held[1:] = np.reshape(controls, held[1:].shape)
         # Exact if the rates are linear between two states, as for a coordinate with held acceleration.
         turned = []
-        for rate in turning(self._scene, columns):
+        for rate in left_out_rates(self._scene, columns):
             rates = np.broadcast_to(rate, n)
             turned.append(np.concatenate([[0.0], np.cumsum(0.5 * dt * (rates[1:] + rates[:-1]))]))
         now = Frame(columns, list(held.T), self._of.share(list(held.T)), target, turned)
@@ -208,7 +208,7 @@ def at_rest(scene: Scene) -> Now:
     )
 
 
-def turning(scene: Scene, state: Sequence[Any]) -> tuple[Any, ...]:
+def left_out_rates(scene: Scene, state: Sequence[Any]) -> tuple[Any, ...]:
     """Return the rates of the places that the state leaves out, in order; unknown ones are 0."""
     layout = layout_of(scene)
     rates = {entry.coordinate: state[i] for i, entry in enumerate(layout.state) if entry.kind == "velocity"}

@@ -74,7 +74,7 @@ def symbolic(scene: Scene) -> Any:
     return twin(scene, symbols)
 
 
-def motion(scene: Scene) -> tuple[Values, Values, Values]:
+def motion_symbols(scene: Scene) -> tuple[Values, Values, Values]:
     """Return places, velocities and controls as SymPy's functions of time."""
     layout = layout_of(scene)
     q: dict[str, Any] = {name: sympy.Function(name, real=True)(t) for name in layout.names}
@@ -97,7 +97,7 @@ def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
 
 
 def _lagrangian(scene: Scene, xp: Any) -> sympy.Expr:
-    copy, (q, v, _) = symbolic(scene), motion(scene)
+    copy, (q, v, _) = symbolic(scene), motion_symbols(scene)
     return xp.rational(copy.kinetic(q, v, xp) - copy.potential(q, xp))
 
 
@@ -118,7 +118,7 @@ def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.E
     xp : namespace, default `Symbolic`
         Functions of SymPy's expressions; with `Exact` the formulas' floats keep their exact values.
     """
-    copy, (q, v, u) = symbolic(scene), motion(scene)
+    copy, (q, v, u) = symbolic(scene), motion_symbols(scene)
     of, rate, energy = q[coordinate], v[coordinate], _lagrangian(scene, xp)
     loss = xp.rational(copy.dissipation(q, v, u, xp))
     force = xp.rational(copy.applied(q, v, u, xp).get(coordinate, 0))
@@ -190,16 +190,19 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
         return {symbol: getattr(spaces[of], key) for symbol, (of, key) in places.items() if of in spaces}
 
     def kinetic(self: Any, q: Any, v: Any, xp: Any) -> Any:
-        return evaluate(expressions["kinetic"], numbers(self, q=q, v=v), xp)
+        return evaluate_expression(expressions["kinetic"], numbers(self, q=q, v=v), xp)
 
     def potential(self: Any, q: Any, xp: Any) -> Any:
-        return evaluate(expressions["potential"], numbers(self, q=q), xp)
+        return evaluate_expression(expressions["potential"], numbers(self, q=q), xp)
 
     def dissipation(self: Any, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        return evaluate(expressions["dissipation"], numbers(self, q=q, v=v, u=u), xp)
+        return evaluate_expression(expressions["dissipation"], numbers(self, q=q, v=v, u=u), xp)
 
     def forces(self: Any, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        return {key: evaluate(force, numbers(self, q=q, v=v, u=u), xp) for key, force in applied.items()}
+        return {
+            key: evaluate_expression(force, numbers(self, q=q, v=v, u=u), xp)
+            for key, force in applied.items()
+        }
 
     def reduce(self: Any) -> Any:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -237,7 +240,7 @@ def _name(symbol: Any) -> str:
     raise FormulaError(f"{symbol!r} is neither a SymPy symbol nor a function of time; it cannot be a name")
 
 
-def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
+def evaluate_expression(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     """Return the value of a SymPy expression for numbers of any kind.
 
     Parameters
@@ -249,7 +252,7 @@ def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     xp : namespace
         Functions for these numbers.
     """
-    of: Callable[[Any], Any] = lambda e: evaluate(e, values, xp)  # noqa: E731
+    of: Callable[[Any], Any] = lambda e: evaluate_expression(e, values, xp)  # noqa: E731
     if expression in values:
         return values[expression]
     if expression.is_Integer:

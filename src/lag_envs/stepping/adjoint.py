@@ -127,7 +127,7 @@ class Differentiable(Trace):
         return found
 
 
-def replay(operations: Sequence[Operation], values: Mapping[str, Any], trace: Trace) -> dict[str, Any]:
+def rerun(operations: Sequence[Operation], values: Mapping[str, Any], trace: Trace) -> dict[str, Any]:
     """Carry out operations on the numbers of another recording; return all results by name."""
     known = dict(values)
     for name, op, args in operations:
@@ -171,7 +171,7 @@ class LaneFormula:
         found = formula(trace, numbers)
         operations, results = trace.operations([x for numbers in found for x in numbers])
         target = ElementaryTrace()
-        known = replay(operations, {n: target.inputs(n)[0] for n in numbers if n not in absent}, target)
+        known = rerun(operations, {n: target.inputs(n)[0] for n in numbers if n not in absent}, target)
         ends = [known[result] if isinstance(result, str) else float(result) for result in results]
         lines, values = record_block(target, {f"out{i}": end for i, end in enumerate(ends)})
         used = set(re.findall(r"\w+", " ".join([*lines, *map(str, values)])))

@@ -22,7 +22,7 @@ from lag_envs.stepping.series import (
     Series,
     StepProgress,
     Target,
-    times,
+    matrix_times,
 )
 
 
@@ -242,7 +242,7 @@ class Backward(Series):
             v_bar = t.load(self._bar("v", i), after)
             own = found.get(Factor(slot))
             bars.append(t.mul(step, v_bar) if own is None else t.fma(step, v_bar, own))
-        right = [t.number(0.0) if x is None else x for x in times(t, start.inverse.rows, bars)]
+        right = [t.number(0.0) if x is None else x for x in matrix_times(t, start.inverse.rows, bars)]
         for i, j in self.record.mass:
             less = t.mul(right[i], a[j])
             less = less if i == j else t.fma(right[j], a[i], less)

@@ -65,7 +65,7 @@ def folder() -> Path | None:
         return None
 
 
-def entries(place: Path) -> list[CacheFile]:
+def cache_files(place: Path) -> list[CacheFile]:
     """Return the files in a cache's folder, most recently used first, with leftovers of killed processes."""
     found = []
     with contextlib.suppress(OSError):
@@ -79,13 +79,13 @@ def entries(place: Path) -> list[CacheFile]:
 
 def clear(place: Path) -> int:
     """Remove all files, and return how many there were."""
-    return sum(_remove(entry.path) for entry in entries(place))
+    return sum(_remove(entry.path) for entry in cache_files(place))
 
 
 def trim(place: Path, limit: int) -> None:
     """Remove the least recently used files until the rest has at most `limit` bytes."""
     total = 0
-    for entry in entries(place):
+    for entry in cache_files(place):
         total += entry.size
         if total > limit:
             _remove(entry.path)
@@ -162,7 +162,7 @@ class _DispatcherCache:
 
     def flush(self) -> None:
         """Forget everything compiled from this function."""
-        for entry in entries(folder() or Path()):
+        for entry in cache_files(folder() or Path()):
             if entry.path.name.startswith(f"{self._name}-"):
                 _remove(entry.path)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import LaneLayout, compile_attempt, compile_pull, compile_tangent
+from lag_envs.stepping.machine import LaneLayout, compile_attempt, compile_pull, compile_series_tangent
 from lag_envs.stepping.series import TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
@@ -148,8 +148,8 @@ def compile_advance_block(
 def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of a lane, by which the step is divided, `slopes` those of `compile_tangent`. Where the
-    step is `GUIDED`, they differ in their constants.
+    `rows` are those of a lane, by which the step is divided, `slopes` those of `compile_series_tangent`.
+    Where the step is `GUIDED`, they differ in their constants.
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = dt
@@ -201,8 +201,8 @@ def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-unty
 def compile_advance_tangents(
     record: SeriesRecord, columns: tuple[str, ...], guided: bool = False, tolerance: float = TOLERANCE
 ) -> Callable:
-    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`, `compile_tangent`."""
-    helpers = compile_attempt(record, 1), compile_tangent(record, columns)
+    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`."""
+    helpers = compile_attempt(record, 1), compile_series_tangent(record, columns)
     numbers = _numbers(record, tolerance) | {"GUIDED": guided}
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)

@@ -361,7 +361,7 @@ def slots_for(columns: int) -> int:
     return 1 << max(columns - 1, 0).bit_length()
 
 
-def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
+def compile_series_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
     The rows are inputs, places and velocities as in `LaneLayout`, the time since the control step began, the

@@ -627,7 +627,7 @@ def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Sta
 # --- the series' step, and running what was printed ---------------------------------------------------------
 
 
-def motion(
+def script_motion(
     t: Script,
     record: SeriesRecord,
     inputs: dict[str, Any],

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, KNOWN, Node, SeriesRecord
-from lag_envs.stepping.tracing import MAGIC, Operation, evaluate
+from lag_envs.stepping.tracing import MAGIC, Operation, evaluate_operations
 
 #: The orders that a series may have.
 SMALLEST_ORDER, LARGEST_ORDER = 4, 24
@@ -491,7 +491,7 @@ class Series:
 
     def _accelerate(self, t: Target, inverse: Inverse, right: Sequence, h: Any, k: Any) -> list:
         """Store a_k and v_{k+1}; return a_k."""
-        a = [t.number(0.0) if x is None else x for x in times(t, inverse.rows, right)]
+        a = [t.number(0.0) if x is None else x for x in matrix_times(t, inverse.rows, right)]
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
         for i in range(self.size):
@@ -723,7 +723,7 @@ def _add_product(t: Target, total: Any, a: Any, b: Any) -> Any:
     return t.mul(a, b) if total is None else t.fma(a, b, total)
 
 
-def times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
+def matrix_times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
     """Return a matrix times a vector; None stands for zero."""
     result = []
     for row in matrix:
@@ -794,17 +794,19 @@ class Certificate:
         for i in self._series._live:
             self._tails[i] = self._tail(i)
         right, change = self._balance()
-        base = [t.number(0.0) if b is None else t.mul(self._h, b) for b in times(t, self._inverse, right)]
+        base = [
+            t.number(0.0) if b is None else t.mul(self._h, b) for b in matrix_times(t, self._inverse, right)
+        ]
         coupled = any(e is not None for row in change for e in row)
         # The fixed point of E = base + C E by a few terms of its Neumann series, a little enlarged; any E > 0
         # that passes the strict inequality is as good as another.
         matrix: list = [[None] * n for _ in range(n)]
         if coupled:
-            columns = [times(t, self._inverse, column) for column in zip(*change, strict=True)]
+            columns = [matrix_times(t, self._inverse, column) for column in zip(*change, strict=True)]
             matrix = [list(row) for row in zip(*columns, strict=True)]
 
         def again(guess: list) -> list:
-            more = times(t, matrix, guess)
+            more = matrix_times(t, matrix, guess)
             return [b if m is None else t.add(b, m) for b, m in zip(base, more, strict=True)]
 
         guess = base
@@ -1128,7 +1130,7 @@ class Plain:
         if self._functions is not None:
             return self._functions[name](x)
         operations, result = elementary(name, fused=False)
-        return evaluate(operations, {"x": x})[result]
+        return evaluate_operations(operations, {"x": x})[result]
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
-        return evaluate(record.scalars, inputs, self._functions)
+        return evaluate_operations(record.scalars, inputs, self._functions)

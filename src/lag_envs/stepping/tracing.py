@@ -248,7 +248,7 @@ class Trace:
 
         The operations are in order, without those that no output needs. Inputs named in `zeros` are known to
         be zero, like the numbers that `zero` returns. With ``fused=False`` no product is fused with a sum:
-        then all operations round alike on every machine and in every language (see `evaluate`).
+        then all operations round alike on every machine and in every language (see `evaluate_operations`).
         """
         outputs = list(outputs)
         results = [_name(value) for value in outputs]
@@ -345,7 +345,7 @@ class Trace:
         return self.record("copysign", a, sign)
 
 
-def evaluate(
+def evaluate_operations(
     operations: Iterable[Operation],
     values: Mapping[str, Any],
     functions: Mapping[str, Callable] | None = None,

@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.envs.imperfect.twice import Twice, TwiceFunctions, rounded
+from lag_envs.envs.imperfect.twice import Twice, TwiceFunctions, nearest_float
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import formula as naming
 from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values, twin
@@ -69,7 +69,7 @@ class DerivedConstants:
             (inertia,) = evaluate([form.inertia], values, functions)
             found = [x / inertia for x in found]
         found += evaluate(list(lagged.values()), values, functions)
-        return {name: rounded(x) for name, x in zip([*wanted, *lagged], found, strict=True)}
+        return {name: nearest_float(x) for name, x in zip([*wanted, *lagged], found, strict=True)}
 
     def lines(self, constants: dict[str, Any]) -> list[str]:
         """Return the lines that draw parameters from ``share0``, ... and fill in the constants."""

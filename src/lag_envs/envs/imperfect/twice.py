@@ -55,7 +55,7 @@ def _twice(value: Any) -> Twice:
     return Twice(float(exact), float(exact - Fraction(float(exact))))
 
 
-def rounded(value: Any) -> Any:
+def nearest_float(value: Any) -> Any:
     """Return the nearest float."""
     return value.high + value.low if isinstance(value, Twice) else float(value)
 
@@ -69,4 +69,4 @@ class TwiceFunctions:
         self._trace = trace
 
     def __getattr__(self, name: str) -> Any:
-        return lambda x: Twice(getattr(self._trace, name)(rounded(x)))
+        return lambda x: Twice(getattr(self._trace, name)(nearest_float(x)))

@@ -17,7 +17,7 @@ from lag_envs.leaderboard.architecture import Array, Head
 from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, Linear, Network
 from lag_envs.leaderboard.policies import ControllerPolicy, SubmittedPolicy
-from lag_envs.leaderboard.site.scenery import picture
+from lag_envs.leaderboard.site.scenery import picture_data
 from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_names
@@ -165,7 +165,7 @@ def _units(task: Task) -> list[str]:
 
 
 def _look(task: Task) -> dict[str, Any]:
-    found = picture(Picture(task)) or {}
+    found = picture_data(Picture(task)) or {}
     return {key: found.get(key) for key in ("shapes", "window")}
 
 
