@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
 from agents.learners import LearnerSettings, trainable
-from agents.ppo import ActingPolicy, network, shared_weights
+from agents.ppo import Policy, network, shared_weights
 from agents.run import FIRST_FRESH_SEED, UserError
 from lag_envs.controllers import build
 from lag_envs.envs.stagger import stagger
@@ -88,7 +88,7 @@ class Learner:
         self.seen, self.wanted = np.empty((0, wide), np.float32), np.empty((0, formulas.actions), np.float32)
         self.actor = network([wide, *settings.actor, formulas.actions], settings.first_layer_scale)
         self.adam = torch.optim.Adam(self.actor.parameters(), fused=True)
-        self.policy = ActingPolicy(shared_weights(self.actor), (), formulas.largest)
+        self.policy = Policy(shared_weights(self.actor), (), formulas.largest)
 
     def iterate(self) -> None:
         """Collect the controller's actions, and learn them."""

@@ -99,7 +99,7 @@ def shared_weights(layers: nn.Sequential) -> list[tuple[Array, Array]]:
     return [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
 
 
-class ActingPolicy:
+class Policy:
     """The acting policy: a network's weights as NumPy arrays, faster than PyTorch for small batches.
 
     Parameters
@@ -159,7 +159,7 @@ class ActingPolicy:
         write_file(path, file.getvalue())
 
     @classmethod
-    def load(cls, path: Path) -> ActingPolicy:
+    def load(cls, path: Path) -> Policy:
         """Return the policy that `save` wrote."""
         with np.load(path, allow_pickle=False) as found:
             count = sum(name.startswith("weight_") for name in found)
@@ -201,7 +201,7 @@ class GaussianActor:
 class CategoricalActor:
     """Discrete actions: the actor outputs a logit for each value of each list."""
 
-    def __init__(self, policy: ActingPolicy) -> None:
+    def __init__(self, policy: Policy) -> None:
         self.policy = policy
         self.parameters: list[nn.Parameter] = []
 
@@ -265,7 +265,7 @@ class Learner:
         inputs, outputs = self.observation.shape[1], sum(formulas.choices) or formulas.actions
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
-        self.policy = ActingPolicy([], formulas.choices, formulas.largest)
+        self.policy = Policy([], formulas.choices, formulas.largest)
         self.head = (
             CategoricalActor(self.policy) if formulas.choices else GaussianActor(settings, formulas.actions)
         )

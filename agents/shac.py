@@ -30,7 +30,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
 from agents.learners import LearnerSettings, trainable
-from agents.ppo import ActingPolicy, network, shared_weights
+from agents.ppo import Policy, network, shared_weights
 from agents.run import FIRST_FRESH_SEED, UserError
 from lag_envs.torch import Step
 
@@ -139,7 +139,7 @@ class Learner:
             torch.optim.Adam(self.actor.parameters(), fused=True),
             torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, fused=True),
         ]
-        self.policy = ActingPolicy(shared_weights(self.actor), (), formulas.largest)
+        self.policy = Policy(shared_weights(self.actor), (), formulas.largest)
         start = deepcopy(self.state())
         self.gradients(self.collect())  # compiles
         self.restore(start)

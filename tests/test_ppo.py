@@ -366,10 +366,10 @@ def test_networks_of_any_actions_act_as_on_the_leaderboard(task, tmp_path):
     outputs, file = sum(formulas.choices) or formulas.actions, tmp_path / MODEL
     draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
     layers = [(draw(8, wide), draw(8)), (draw(outputs, 8), draw(outputs))]
-    ppo.ActingPolicy(layers, formulas.choices, formulas.largest).save(file)
+    ppo.Policy(layers, formulas.choices, formulas.largest).save(file)
     table, arrays = arrays_of(file)
     theirs, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
-    policy = ppo.ActingPolicy.load(file)
+    policy = ppo.Policy.load(file)
     ours = policy.predict(seen)[0]
     np.testing.assert_array_equal(ours, theirs.predict(seen)[0])
     assert np.ptp(ours) >= formulas.largest

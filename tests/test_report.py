@@ -217,8 +217,8 @@ def test_compact_form(written, tmp_path, monkeypatch):
     monkeypatch.setattr(
         docs, "PARTS", (docs.PagePart(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
     )
-    monkeypatch.setattr(docs.overview, "draw", lambda _: Figure())
-    monkeypatch.setattr(docs.overview, "findings", lambda _: ["Nobody is faster."])
+    monkeypatch.setattr(docs.overview, "draw_overview", lambda _: Figure())
+    monkeypatch.setattr(docs.overview, "overview_sentences", lambda _: ["Nobody is faster."])
     assert docs.main([str(written), str(tmp_path)]) == 0
     text = (tmp_path / "docs" / "accuracy-details.md").read_text(encoding="utf-8")
     assert "| There are five. | **holds** | 5 found |" in text

@@ -269,7 +269,7 @@ def _short(text: str) -> str:
 # --- the command --------------------------------------------------------------------------------------------
 
 
-def declare_replay(parser: argparse.ArgumentParser) -> None:
+def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``replay``."""
     parser.add_argument("link", metavar="LINK", help="the link, or its part after #; quote it")
     parser.add_argument("--file", metavar="FILE", help="the Python file of your own that has the environment")
