@@ -69,8 +69,8 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
             yield name, [agent]
     board, names = Board(BOARD), {learner_label(algo): algo for algo in LEARNERS}
     for entry in sorted(board.read().entries.values(), key=lambda entry: entry.id):
-        ours = entry.env == env_id and entry.kind == "learned" and list(entry.authors) == AUTHORS
-        if ours and entry.state == "verified":
+        own = entry.env == env_id and entry.kind == "learned" and list(entry.authors) == AUTHORS
+        if own and entry.state == "verified":
             yield (
                 names[entry.name],
                 [policy.agent() for _, policy in load(board.submission(entry.id)).policies],

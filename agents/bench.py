@@ -59,7 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     learn = [Contestant(k, ENV, "PPO", TRAINED, partial(training, f)) for k, f in kinds.items()]
     # A sample of training is at least one roll-out with its updates, however short a sample is requested.
     complete = measure_rates(steps, args.rounds, 0.1) and measure_rates(learn, args.rounds, 0.1)
-    rows = [rates_and_ratio(ours, theirs) for ours, theirs in zip(*[iter(steps + learn)] * 2, strict=True)]
+    rows = [
+        rates_and_ratio(adapter, dummy) for adapter, dummy in zip(*[iter(steps + learn)] * 2, strict=True)
+    ]
     print("\n".join(table_lines(rows)))
     if args.output:
         about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
@@ -109,13 +111,13 @@ def training(make: Any) -> Run:
     return run
 
 
-def rates_and_ratio(ours: Contestant, theirs: Contestant) -> dict[str, Any]:
+def rates_and_ratio(adapter: Contestant, dummy: Contestant) -> dict[str, Any]:
     """Return both rates [steps/s] and their ratio: lower quartile, median and upper quartile."""
     row: dict[str, Any] = {
-        "kind": ours.kind, "num_envs": ours.num_envs, "problem": ours.problem or theirs.problem,
-        "adapter": ours.rates, "dummy": theirs.rates,
+        "kind": adapter.kind, "num_envs": adapter.num_envs, "problem": adapter.problem or dummy.problem,
+        "adapter": adapter.rates, "dummy": dummy.rates,
     }  # fmt: skip
-    pairs = ratios(ours.rates, theirs.rates)
+    pairs = ratios(adapter.rates, dummy.rates)
     return row | ({"ratio": quartiles(pairs)} if pairs else {})
 
 

@@ -91,8 +91,8 @@ def test_vector_is_single(task):
     for envs in (single, native):
         envs.reset(seed=5)
     for a in actions(250, 3, 2):
-        for ours, theirs in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+        for batched, alone in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
+            np.testing.assert_array_equal(batched, alone)
 
 
 def test_controllers(task):
@@ -240,8 +240,8 @@ def test_the_toy_as_an_environment(toy):
     for envs in (single, native):
         envs.reset(seed=5)
     for a in actions(700, 3, 1):
-        for ours, theirs in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+        for batched, alone in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
+            np.testing.assert_array_equal(batched, alone)
     check_env(gym.make(TOY, damping=0.2).unwrapped, skip_render_check=not RENDERS)
     with pytest.raises(ValueError, match="length must be above 0 m, got -1 m"):
         gym.make(TOY, length=-1.0)

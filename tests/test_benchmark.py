@@ -179,9 +179,9 @@ def test_bench_writes_json_and_goes_on_past_failing_peers(tmp_path, capsys, monk
     assert report["versions"].keys() >= {"lag_envs", "gymnasium", "numpy", "numba"}
     assert report["machine"].keys() >= {"processor", "cores", "system", "python"}
     for kind, n in (("made", 1), ("unwrapped", 1), ("vector", 1), ("vector", 3)):
-        ours = row(report, ID, kind, n)
-        assert len(ours["rates"]) == 2 and all(rate > 0.0 for rate in ours["rates"])
-        assert len(ours["ratio"]) == 3
+        measured = row(report, ID, kind, n)
+        assert len(measured["rates"]) == 2 and all(rate > 0.0 for rate in measured["rates"])
+        assert len(measured["ratio"]) == 3
     assert row(report, "CartPole-v1", "made")["ratio"] == [1.0, 1.0, 1.0]
     assert row(report, "Pendulum-v1", "made")["rates"]
 
@@ -327,22 +327,22 @@ def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
 
     from lag_envs.envs.single import LagrangianEnv
 
-    ours = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
-    theirs = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
-    theirs.tau = 1e-4
+    twin = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
+    original = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
+    original.tau = 1e-4
     start = np.array([0.01, -0.02, 0.03, 0.04])
-    ours.reset(options={"state": start})
-    theirs.reset(seed=0)
-    theirs.state = start
+    twin.reset(options={"state": start})
+    original.reset(seed=0)
+    original.state = start
     for i in range(20_000):
         action = (i // 700) % 2
-        a, b = ours.step(action), theirs.step(action)
+        a, b = twin.step(action), original.step(action)
         assert a[2] == b[2] or abs(abs(a[0][2]) - np.radians(12.0)) < 2e-3
         if a[2] or b[2]:
             break
     assert i > 1000
     np.testing.assert_allclose(a[0], b[0], atol=5e-3)
-    assert ours.action_space == theirs.action_space
+    assert twin.action_space == original.action_space
 
 
 # --- statistics on known numbers ---

@@ -587,20 +587,20 @@ def test_times_grow_even_if_the_clock_is_set_back(board):
 def test_two_clones_that_both_added(board, tmp_path):
     """Git's merge is a conflict; the second to push takes the other's log and adds again."""
     add(board, nonce="1")
-    mine, theirs = tmp_path / "mine", tmp_path / "theirs"
-    for clone, name in ((mine, "TQC"), (theirs, "SAC")):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for clone, name in ((first, "TQC"), (second, "SAC")):
         shutil.copytree(board.folder, clone / "board")
         add(Board(clone / "board"), name)
-    base, a, b = (path / "board.jsonl" for path in (board.folder, mine / "board", theirs / "board"))
+    base, a, b = (path / "board.jsonl" for path in (board.folder, first / "board", second / "board"))
     for how in ([], ["--union"]):  # a union would keep both, and break the chain
         merge = ["git", "merge-file", *how, "-p", str(a), str(base), str(b)]
         merged = subprocess.run(merge, capture_output=True).stdout
         with pytest.raises(BoardError, match=r"line \d+ is (no event|not what followed)"):
             parse(merged)
     shutil.copy(b, a)
-    mine = Board(mine / "board")
-    mine.add(fake_submissions.load(next(mine.folder.glob("submissions/*-tqc-*"))))
-    assert {e.name: e.state for e in mine.read().entries.values()} == {
+    first = Board(first / "board")
+    first.add(fake_submissions.load(next(first.folder.glob("submissions/*-tqc-*"))))
+    assert {e.name: e.state for e in first.read().entries.values()} == {
         "PPO": "verified", "SAC": "pending", "TQC": "pending",
     }  # fmt: skip
 

@@ -583,8 +583,8 @@ def test_chain_of_one_bar_is_the_bar(damping):
         rtol=1e-13,
     )
     for call in ("energy", "forces", "power"):
-        mine, theirs = getattr(chain, call)(states, controls), getattr(bar, call)(states, controls)
-        for name, value in theirs.items():
+        mine, of_bar = getattr(chain, call)(states, controls), getattr(bar, call)(states, controls)
+        for name, value in of_bar.items():
             np.testing.assert_allclose(mine[name], value, rtol=1e-12, atol=1e-12)
 
 

@@ -134,10 +134,10 @@ def test_links_lead_somewhere(site, pages):
 def test_what_is_bundled_is_noticed(site):
     """NOTICE.md covers each third-party script and style."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
-    ours = {"docs.css", "docs.js"}
+    own_files = {"docs.css", "docs.js"}
     for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
         place = path.relative_to(site)
-        if place.parts[0] in ("board", "search") or path.name in ours:
+        if place.parts[0] in ("board", "search") or path.name in own_files:
             continue
         assert place.parts[0] == "assets", place
     for name in ("Material for MkDocs", "iframe-worker", "lunr", "RxJS", "clipboard.js", "Icons"):

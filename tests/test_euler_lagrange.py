@@ -339,7 +339,7 @@ def test_exact_flow_and_general_series_agree(case):
     for dt in (0.005, 0.02, 0.05):
         state = generator.uniform(-2.0, 2.0, len(scene.state_names))
         given = generator.uniform(0.0, 2.0, (40, len(scene.control_names)))
-        ours = scene.simulate(state, given, dt)
-        theirs = ours.copy()
-        assert code.simulation(theirs, given, dt, 20.0, *numbers) == 0
-        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-11 * np.abs(ours).max())
+        by_flow = scene.simulate(state, given, dt)
+        by_series = by_flow.copy()
+        assert code.simulation(by_series, given, dt, 20.0, *numbers) == 0
+        np.testing.assert_allclose(by_flow, by_series, rtol=0.0, atol=1e-11 * np.abs(by_flow).max())

@@ -392,7 +392,7 @@ def test_a_state_of_another_length_is_refused():
 
 
 def test_it_shares_no_code_with_what_it_checks():
-    """Neither equations nor stepping: it imports SymPy's view of a scene and nothing else of ours."""
+    """Neither equations nor stepping: it imports SymPy's view of a scene and nothing else of the package."""
     import ast
     from pathlib import Path
 

@@ -208,12 +208,14 @@ def test_a_plan_is_followed_and_held():
 def test_a_plan_does_what_the_controller_of_such_numbers_does(tmp_path):
     """Also where it acts ten times as often."""
     env = incline.Tilt.id
-    ours = Tracking(TASKS[env](), **numbers(env, PLAN))
+    tracking = Tracking(TASKS[env](), **numbers(env, PLAN))
     made = submission(tmp_path / "a", env, PLAN)
     assert made.kind == "controller"
     for options in ({}, often(env).options):
-        theirs = made.policies[0][1].agent()
-        assert np.array_equal(play(env, theirs, range(3), **options), play(env, ours, range(3), **options))
+        submitted = made.policies[0][1].agent()
+        assert np.array_equal(
+            play(env, submitted, range(3), **options), play(env, tracking, range(3), **options)
+        )
 
 
 @pytest.mark.slow

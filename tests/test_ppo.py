@@ -350,9 +350,9 @@ def test_five_seeds_are_a_submission(tmp_path):
     made = submit.submit_learned(ENV, tmp_path / "runs" / ENV / ppo.NAME, tmp_path / "out")
     assert made.name == "fast PPO" and len(load(tmp_path / "out").policies) == 5
     seen = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
-    ours = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
-    theirs = dict(load(tmp_path / "out").policies)[2].agent()
-    np.testing.assert_array_equal(ours.predict(seen)[0], theirs.predict(seen)[0])
+    loaded = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
+    submitted = dict(load(tmp_path / "out").policies)[2].agent()
+    np.testing.assert_array_equal(loaded.predict(seen)[0], submitted.predict(seen)[0])
     # A file alone does not tell how long it was trained.
     file = tmp_path / "runs" / ENV / ppo.NAME / "seed2" / MODEL
     with pytest.raises(ExportError, match="not known how long it was trained; give --env-steps"):
@@ -368,14 +368,14 @@ def test_networks_of_any_actions_act_as_on_the_leaderboard(task, tmp_path):
     layers = [(draw(8, wide), draw(8)), (draw(outputs, 8), draw(outputs))]
     ppo.Policy(layers, formulas.choices, formulas.largest).save(file)
     table, arrays = arrays_of(file)
-    theirs, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
+    submitted, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
     policy = ppo.Policy.load(file)
-    ours = policy.predict(seen)[0]
-    np.testing.assert_array_equal(ours, theirs.predict(seen)[0])
-    assert np.ptp(ours) >= formulas.largest
+    loaded = policy.predict(seen)[0]
+    np.testing.assert_array_equal(loaded, submitted.predict(seen)[0])
+    assert np.ptp(loaded) >= formulas.largest
     # To the bit, however many act together.
-    np.testing.assert_array_equal(ours[:7], policy.predict(seen[:7])[0])
-    np.testing.assert_array_equal(ours[0], policy.predict(seen[0])[0])
+    np.testing.assert_array_equal(loaded[:7], policy.predict(seen[:7])[0])
+    np.testing.assert_array_equal(loaded[0], policy.predict(seen[0])[0])
 
 
 def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):

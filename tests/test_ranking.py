@@ -279,7 +279,7 @@ def test_references_are_controllers_that_are_known_and_help(env_id):
 @pytest.mark.parametrize(
     "env_id", [pytest.param(i, marks=[] if i == ENV else pytest.mark.slow) for i in REFERENCES]
 )
-def test_means_of_references_are_theirs(env_id):
+def test_means_of_references_are_those_of_the_controllers(env_id):
     """Not another controller's, and not another's error."""
     name, mean, error, episodes = reference(env_id)
     few = play(env_id, make_controller(env_id, name), range(10**10, 10**10 + 500))

@@ -852,8 +852,8 @@ def test_pictures_are_those_of_the_page(env_id, page):
 
     task = TASKS[env_id]
     now, picture = moment(task), Picture(task)
-    theirs = page.evaluate(PAINT, [scenery.picture_data(picture), picture.poses(now), rendering.MARGIN])
-    png = io.BytesIO(base64.b64decode(theirs.partition(",")[2]))
-    theirs = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
-    apart = np.abs(theirs - rendering.paint(task, now)).max(axis=2)
+    by_page = page.evaluate(PAINT, [scenery.picture_data(picture), picture.poses(now), rendering.MARGIN])
+    png = io.BytesIO(base64.b64decode(by_page.partition(",")[2]))
+    by_page = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
+    apart = np.abs(by_page - rendering.paint(task, now)).max(axis=2)
     assert apart.mean() < 0.4 and np.mean(apart > 64) < 0.001, (apart.mean(), np.mean(apart > 64))

@@ -28,7 +28,7 @@ def task(id, **keywords):
 def runs():
     rows = []
     for name in conservation.FREE:
-        rows += conservation.free(name, conservation.OURS, 10_000)
+        rows += conservation.free(name, conservation.LAG_ENVS, 10_000)
     for method in ("RK4", "Verlet"):
         rows += conservation.free("bar, 2 rad", method, 10_000)
     return [*rows, *conservation.energy_imbalance("CylinderInCylinder, tilt", 20)]
@@ -44,8 +44,8 @@ def test_claims_hold(runs):
         assert picture.draw().axes
 
 
-def test_energy_of_ours_and_of_others(runs):
-    """Ours is at rounding; Verlet's drift is bounded and RK4's grows, as in theory."""
+def test_energy_of_lag_envs_and_of_others(runs):
+    """lag_envs is at rounding; Verlet's drift is bounded and RK4's grows, as in theory."""
     drift = {(r["name"], r["method"]): r for r in runs if r["kind"] == "drift"}
     for name in conservation.FREE:
         limit = 1e-12 if name == "incline" else 1e-13
@@ -59,7 +59,7 @@ def test_energy_of_ours_and_of_others(runs):
 def test_march_is_simulate():
     """The loop of the long runs gives the bits of `Scene.simulate`."""
     problem = conservation.FREE["bar, turning over"]
-    end = conservation.lifted_run(problem, conservation.OURS, np.array([7, 1000]))
+    end = conservation.lifted_run(problem, conservation.LAG_ENVS, np.array([7, 1000]))
     path = problem.scene.simulate(problem.state, np.zeros(1000), problem.dt)
     np.testing.assert_array_equal(end[:, :2], path[[7, 1000]])
 
@@ -108,7 +108,7 @@ def test_what_is_left_out_saves_operations():
 def test_cosine_and_sine_stay_a_pair(name):
     """c² + s² does not grow; θ differs from the pair's angle only by its own accumulated roundings."""
     at = conservation.marks(100_000)
-    theta, _, c, s = conservation.lifted_run(conservation.FREE[name], conservation.OURS, at).T
+    theta, _, c, s = conservation.lifted_run(conservation.FREE[name], conservation.LAG_ENVS, at).T
     assert np.abs(c * c + s * s - 1.0).max() < 1e-15
     turns = (theta - np.arctan2(s, c)) / (2.0 * math.pi)
     apart = 2.0 * math.pi * np.abs(turns - np.round(turns))

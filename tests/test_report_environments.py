@@ -255,11 +255,11 @@ def test_undriven_pendulum(rows):
     angles = {row["case"]: environment_results._angle(row) for row in rows if row["seed"] is None}
     assert angles["Pendulum-v1, undriven"] == pytest.approx(0.178, abs=0.0005)
     assert angles[f"{pivoted_bar.SwingUpFree.id} with Pendulum-v1's equation, undriven"] < 2e-12
-    assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["ours"])
+    assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["own"])
 
 
 def test_a_worse_stepper_breaks_the_claims(rows):
-    """RK4, once per control step, in place of ours."""
+    """RK4, once per control step, in place of the shipped step."""
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)
     episode = record_episode(env, endless_actions(env, 0))

@@ -114,7 +114,7 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
 
 @pytest.mark.parametrize("together", [False, True])
 @pytest.mark.parametrize("name", ["cart-pole", "double pendulum, driven"])
-def test_ours_is_what_simulate_does(name, together):
+def test_it_is_what_simulate_does(name, together):
     """The timed code has the bits of `simulate`."""
     problems, _ = problem(name)
     order = int(order_of(problems.scene, general_results.DT))
@@ -155,9 +155,9 @@ def point(family, method, setting, error, ns, mode="single", batched=True, clock
 
 
 ROWS = [
-    point("ours", "lag_envs, order 8", 1e-4, 1e-5, 50.0),
-    point("ours", "lag_envs, order 16", 1e-12, 1e-13, 80.0),
-    point("ours", "lag_envs, order 16", 1e-12, 1e-13, 20.0, "batch"),
+    point("lag_envs", "lag_envs, order 8", 1e-4, 1e-5, 50.0),
+    point("lag_envs", "lag_envs, order 16", 1e-12, 1e-13, 80.0),
+    point("lag_envs", "lag_envs, order 16", 1e-12, 1e-13, 20.0, "batch"),
     point("heyoka", "Taylor", 1e-9, 1e-10, 160.0, clock=200.0),
     point("mujoco", "RK4", 8, 1e-4, 900.0, batched=False),
 ]
@@ -175,7 +175,7 @@ def test_times_are_compared_at_equal_error_in_one_clock():
 def test_a_defeat_is_told_like_a_win():
     rows = [*ROWS, point("compiled", "RK4", 1, 1e-4, 10.0)]
     content = general_results.content(rows, [])
-    alone = next(c for c in content.claims if "compiled like ours, alone" in c.text)
+    alone = next(c for c in content.claims if "compiled like lag_envs, alone" in c.text)
     assert alone.holds is False and "RK4, compiled by 5.00 (cart-pole, 0.001)" in alone.evidence
     assert any(
         "RK4, compiled takes 0.2 to 0.2 times our time, and is faster in 1 of 1" in t for t in content.text

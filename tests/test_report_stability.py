@@ -172,23 +172,23 @@ def test_amplification_of_an_upright_bar():
 
 
 def test_heavy_damping():
-    """At γ dt = 1e4 explicit Euler and RK4 diverge, ours and the exponential stepper do not."""
+    """At γ dt = 1e4 explicit Euler and RK4 diverge, lag_envs and the exponential stepper do not."""
     (row,) = stability.map_errors("damping", "PivotedBar", 0.02, [1e4])
     errors = row["errors"]
     assert errors["explicit Euler"] == errors["RK4, 16"] == stability_results.DIVERGED
-    assert errors["ours"] < 1e-12
-    assert errors["ours"] < errors["ETD4RK"] < 1e-10
-    assert errors["ours, float32"] == stability_results.TOO_LONG
+    assert errors["lag_envs"] < 1e-12
+    assert errors["lag_envs"] < errors["ETD4RK"] < 1e-10
+    assert errors["lag_envs, float32"] == stability_results.TOO_LONG
 
 
 @pytest.mark.parametrize("name", stability_maps.STARTS)
 def test_ordinary_cells(name):
-    """In float64 ours is exact to rounding; in float32 every method is as exact as float32 can be."""
+    """In float64 lag_envs is exact to rounding; in float32 every method is as exact as float32 can be."""
     rows = list(stability.map_errors("damping", name, 0.02, [1e-3, 1e-2]))
     for row in rows:
         errors = row["errors"]
-        assert errors["ours"] < 2e-15
-        assert 1e-9 < errors["ours, float32"] < 1e-5
+        assert errors["lag_envs"] < 2e-15
+        assert 1e-9 < errors["lag_envs, float32"] < 1e-5
         assert errors["explicit Euler"] > errors["RK4"]
         assert errors["RK4, float32"] < 1e-5
     content = stability.content(rows, [])
@@ -200,7 +200,7 @@ def test_ordinary_cells(name):
 def test_float32_of_ordinary_steps():
     """Errors of single precision, between 1e-8 and 1e-5, over an ensemble."""
     found = [case._replace(scene=PivotedBar(track=None)) for case in ensemble("PivotedBar", 20, seed=2)]
-    ends = stability.methods(found, 0.02)["ours, float32"]
+    ends = stability.methods(found, 0.02)["lag_envs, float32"]
     worst = 0.0
     for case, end in zip(found, ends, strict=True):
         exact = case.scene.simulate(case.state, [case.control], 0.02)[-1]
@@ -237,8 +237,8 @@ def test_refused_and_amplified_cells():
     """A fast start is refused; 850,000 substeps in a shell that leaves no room are accurate to rounding."""
     (fast,) = stability.map_errors("speed", "PivotedBar", 1.0, [1e7])
     (tight,) = stability.map_errors("arm", "CylinderInCylinder, drag", 1.0, [1e-9])
-    assert fast["errors"]["ours"] == stability_results.REFUSED
-    assert tight["errors"]["ours"] > 1e-12
+    assert fast["errors"]["lag_envs"] == stability_results.REFUSED
+    assert tight["errors"]["lag_envs"] > 1e-12
     assert tight["roundings"] < extremes.ROUNDINGS
     content = stability.content([fast, tight], [])
     assert content.claims[0].holds

@@ -19,7 +19,7 @@ from lag_envs.report.points import MODES, WorkPrecisionPoint
 from lag_envs.report.rivals import CompiledMethod, ShippedStepping
 from lag_envs.report.runner import JobResult
 from lag_envs.report.timing import FlowSteps
-from lag_envs.report.verdicts import OURS, TARGETS
+from lag_envs.report.verdicts import LAG_ENVS, TARGETS
 from lag_envs.report.work_precision import OrderedMethod
 from lag_envs.scenes.derivation import form_of
 
@@ -57,7 +57,7 @@ def test_order_of_convergence(method):
     assert work_precision.measured_order(method, single_steps()) == pytest.approx(method.order, abs=0.2)
 
 
-# --- ours ---
+# --- the shipped stepping ---
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -68,8 +68,8 @@ def test_a_step_is_exact(name, mode):
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_ours_is_what_simulate_does(name):
-    """The code timed as ours has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
+def test_the_shipped_stepping_is_what_simulate_does(name):
+    """What is timed has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
     dt, steps = work_precision.control_step(name), 3
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
@@ -88,15 +88,15 @@ def test_ours_is_what_simulate_does(name):
 
 @pytest.mark.parametrize("quick", [True, False])
 @pytest.mark.parametrize("name", VARIANTS)
-def test_only_what_is_shipped_counts_as_ours(name, quick, monkeypatch):
+def test_only_what_is_shipped_counts_as_lag_envs(name, quick, monkeypatch):
     """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
         found = work_precision.variant_rivals(name, horizon, "compiled", quick)
-        assert {r.method for r in found if r.family == "ours"} <= {
+        assert {r.method for r in found if r.family == "lag_envs"} <= {
             ShippedStepping.METHOD,
             ShippedStepping.ONE_CALL,
         }
-        assert {r.family for r in found} == {"ours", "compiled"}
+        assert {r.family for r in found} == {"lag_envs", "compiled"}
         assert not any("series" in r.method for r in found)
     flows = []
     original = FlowSteps.__init__
@@ -224,7 +224,7 @@ def test_all_libraries_at_their_finest(package, name, mode):
 
 
 def test_a_scene_of_ones_own():
-    """Rivals take any equation: here one that is no flow of ours, with two angles that are carried along."""
+    """Rivals take any equation: here one without its own flow, with two angles that are carried along."""
 
     class Coupled(Equation):
         """Two pendulums with a spring; closed form for small swings in phase: cos(√p t)."""
@@ -312,7 +312,7 @@ def both(*args, **options):
     return [row(*args, mode=mode, **options) for mode in MODES]
 
 
-OWN = both(OURS, 100.0, 1e-16, family="ours")
+OWN = both(LAG_ENVS, 100.0, 1e-16, family="lag_envs")
 
 
 def claimed(rows, horizon="One step"):
@@ -345,15 +345,17 @@ def test_a_slower_rival_is_a_win():
     assert claimed(rows).holds is True
     assert claimed(rows).evidence == "2 of 2; the fastest rivals take 2.5 to 2.5 × our time"
     assert (
-        "To 1e-12: ours is faster in 2 of 2, where the fastest rival takes 2.5 times as long."
+        "To 1e-12: lag_envs is faster in 2 of 2, where the fastest rival takes 2.5 times as long."
         in work_precision.content(rows, []).summary.caption
     )
 
 
 def test_a_rival_that_gets_there_alone_is_a_defeat():
-    rows = both(OURS, 100.0, 1e-10, family="ours") + both("DOP853", 250.0, 1e-13)
-    assert claimed(rows).holds is False and "ours not at all" in claimed(rows).evidence
-    assert "ours does not get there and a rival does in 2" in " ".join(work_precision.content(rows, []).text)
+    rows = both(LAG_ENVS, 100.0, 1e-10, family="lag_envs") + both("DOP853", 250.0, 1e-13)
+    assert claimed(rows).holds is False and "lag_envs not at all" in claimed(rows).evidence
+    assert "lag_envs does not get there and a rival does in 2" in " ".join(
+        work_precision.content(rows, []).text
+    )
 
 
 def test_a_lost_member_reaches_nothing():
@@ -385,7 +387,7 @@ def test_sentences_count_what_the_table_has():
     for variant in VARIANTS:
         for horizon in verdicts.HORIZONS:
             place = {"variant": variant, "horizon": horizon}
-            rows += both(OURS, 100.0, 1e-16, family="ours", **place)
+            rows += both(LAG_ENVS, 100.0, 1e-16, family="lag_envs", **place)
             rows += [
                 row(
                     name, float(rng.uniform(20, 300)), float(10.0 ** rng.uniform(-16, -2)), mode=mode, **place
@@ -406,20 +408,20 @@ def assert_sentences_agree(text, columns, rows):
         horizon = paragraph.partition(".")[0].lower()
         for target, sentence in re.findall(r"To (1e-\d\d): (.*?)\.(?= To 1e|$)", paragraph):
             here = [r for r in found if r["horizon"] == horizon and r["error"] == float(target)]
-            ratios = sorted(r["other / ours"] for r in here if r["other / ours"] is not None)
+            ratios = sorted(r["other / lag_envs"] for r in here if r["other / lag_envs"] is not None)
             lost, won = [r for r in ratios if r < 1.0], [r for r in ratios if r >= 1.0]
-            for words, some in (("a rival is faster in", lost), ("ours is faster in", won)):
+            for words, some in (("a rival is faster in", lost), ("lag_envs is faster in", won)):
                 counts = re.findall(rf"{words} (\d+) of (\d+)", sentence)
                 assert counts == ([(str(len(some)), str(len(here)))] if some else [])
             if lost:
                 assert f"takes {lost[0]:.2g} (" in sentence and f"{lost[-1]:.2g} (" in sentence
             if won:
                 assert re.search(rf"takes {won[0]:.2g}( to {won[-1]:.2g})? times as long", sentence)
-            for words, ours, other in (
+            for words, own, other in (
                 ("nobody else gets there", True, False), ("nobody gets there", False, False),
-                ("ours does not get there and a rival does", False, True),
+                ("lag_envs does not get there and a rival does", False, True),
             ):  # fmt: skip
-                count = sum(bool(r["ours"]) == ours and bool(r["fastest other"]) == other for r in here)
+                count = sum(bool(r["lag_envs"]) == own and bool(r["fastest other"]) == other for r in here)
                 assert (f"{words} in {count} (" in sentence) == bool(count)
             seen += 1
     assert seen == len({(r["horizon"], r["error"]) for r in found}) > 0
@@ -444,27 +446,27 @@ def test_committed_claims_follow_from_the_table():
     rows = [dict(zip(table["columns"], line, strict=True)) for line in table["rows"]]
     for horizon, target in verdicts.CLAIMED.items():
         here = [r for r in rows if (r["horizon"], r["error"]) == (horizon, target)]
-        lost = [r for r in here if r["fastest other"] and (r["other / ours"] or 0.0) < 1.0]
+        lost = [r for r in here if r["fastest other"] and (r["other / lag_envs"] or 0.0) < 1.0]
         claim = next(c for c in section["claims"] if c["text"].startswith(f"{horizon.capitalize()}: nobody"))
         assert claim["holds"] is not bool(lost)
         assert all(r["fastest other"] in claim["evidence"] for r in lost)
 
 
-def test_only_what_is_shipped_is_committed_as_ours():
+def test_only_what_is_shipped_is_committed_as_lag_envs():
     table = next(t for t in committed()["tables"] if t["name"].endswith("targets"))
-    ours = {line[table["columns"].index("ours")] for line in table["rows"]} - {None}
+    methods = {line[table["columns"].index("lag_envs")] for line in table["rows"]} - {None}
     steps = {
         f"{ShippedStepping.METHOD}, {words}"
         for words in ("2 substeps", *(f"a step for {n}" for n in (2, 4, 8)))
     }
-    assert OURS in ours <= {ShippedStepping.METHOD, ShippedStepping.ONE_CALL} | steps
+    assert LAG_ENVS in methods <= {ShippedStepping.METHOD, ShippedStepping.ONE_CALL} | steps
 
 
 def test_jobs_are_brought_to_one_scale():
     """A rival whose job ran on a machine of twice the speed is not counted as twice as fast."""
     slow = both("Taylor", 300.0, 1e-13, family="heyoka", clock=200.0)
     ns = {p.name: p.ns for p in verdicts.gathered(OWN + slow)}
-    assert ns == {OURS: 100.0, "heyoka Taylor": 150.0}
+    assert ns == {LAG_ENVS: 100.0, "heyoka Taylor": 150.0}
 
 
 def test_without_a_batch_it_is_one_after_the_other():
@@ -502,7 +504,7 @@ def test_the_picture_has_the_fastest_form_of_each():
     ]
     figure = diagrams.draw_variant("PivotedBar", points, {})
     assert len(figure.axes) == 2
-    known = {*diagrams.STYLES, *diagrams.OURS}
+    known = {*diagrams.STYLES, *diagrams.OWN_STYLES}
     assert {
         f"{verdicts.LIBRARIES[p]} {m}".partition(",")[0] for p, c in peers.PEERS.items() for m in c.settings
     } <= known

@@ -373,7 +373,7 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
     assert sum(name.startswith("assets/") for name in left) == 5 + len(board_pages.AGENTS)
 
 
-def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):
+def test_a_folder_with_other_files_is_refused(data, tmp_path):
     (tmp_path / "index.html").write_text("mine")
     with pytest.raises(FileExistsError, match="not a leaderboard's"):
         write_page(data, tmp_path)

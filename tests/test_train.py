@@ -160,8 +160,8 @@ def test_hyperparameters_are_there_for_every_environment(algo):
 
 def test_bins_are_gymnasiums():
     with gym.make(ENV) as env:
-        theirs = gym.wrappers.DiscretizeAction(env, 9)
-        np.testing.assert_allclose(bin_centres(9)[:, None], [theirs.action(i) for i in range(9)], atol=1e-7)
+        wrapped = gym.wrappers.DiscretizeAction(env, 9)
+        np.testing.assert_allclose(bin_centres(9)[:, None], [wrapped.action(i) for i in range(9)], atol=1e-7)
 
 
 def test_learners_refuse_what_they_do_not_know(tmp_path):

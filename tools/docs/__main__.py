@@ -1,7 +1,7 @@
 """Write the texts generated from the environments' records into README and docs: ``python -m tools.docs``.
 
 ``python -m tools.docs --pictures`` also draws the environments' moving pictures, from episodes of the
-leaderboard's best learned agents; with ids, only theirs.
+leaderboard's best learned agents; with ids, only those of these environments.
 """
 
 from __future__ import annotations

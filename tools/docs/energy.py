@@ -1,4 +1,4 @@
-"""Gymnasium's environments and ours with the same spaces: one policy in both, and energy against time.
+"""Gymnasium's environments and their counterparts here: one policy in both, and energy against time.
 
 ``python -m tools.docs.energy`` prints the returns of a task's reference controller in both, and draws
 ``docs/images/energy-ID.png``. It plots the energy minus the control's work since the start, under random
@@ -83,14 +83,14 @@ def paths(env_id: str, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     Both start from the same state of mid-task motion, and continue past the end of an episode.
     """
     task = TASKS[env_id]()
-    peer, theirs = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped
-    theirs.reset(seed=seed)
+    peer, original = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped
+    original.reset(seed=seed)
     start = np.array(task.examples.start["state"], np.float64)
-    theirs.state = start[np.argsort(peer.order)]  # type: ignore[attr-defined]
-    actions = endless_actions(theirs, seed)
+    original.state = start[np.argsort(peer.order)]  # type: ignore[attr-defined]
+    actions = endless_actions(original, seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the episode is over
-        own = record_peer(theirs, peer, actions, int(task.limit), to_the_end=False)
+        own = record_peer(original, peer, actions, int(task.limit), to_the_end=False)
     exact, controls = task.scene.simulate(start, own.controls, task.dt), np.array(own.controls)
     times = task.dt * np.arange(len(exact))
     found = {task.peer: own.states[:, list(peer.order)], env_id: exact}

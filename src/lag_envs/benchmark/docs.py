@@ -104,12 +104,12 @@ def _of_series(rows: list[dict[str, Any]], target: SpeedTarget) -> str:
 
 def claim(report: dict[str, Any]) -> str:
     """Return README's summary of speed: the ranges of the table, and how many targets are missed."""
-    ours = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
+    own_rows = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
     kinds = {"a flow of their own": True, "the general series, or imperfections": False}
     lines = [
         [name, *(_range(some, target) for target in TARGETS)]
         for name, own in kinds.items()
-        if (some := [row for row in ours if has_own_flow(row["id"]) is own])
+        if (some := [row for row in own_rows if has_own_flow(row["id"]) is own])
     ]
     places = ["alone", *(f"{target.num_envs:,} at once" for target in TARGETS[1:])]
     missed = [

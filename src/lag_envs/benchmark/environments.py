@@ -46,7 +46,7 @@ def own_vector(id: str, n: int, **keywords: Any) -> Run:
 
 
 def stepped(envs: VectorEnv) -> Run:
-    """Prepare a vector environment of ours."""
+    """Prepare a vector environment of this package."""
     actions = actions_of(envs.single_action_space, envs.num_envs)
     envs.reset(seed=0)
     stagger_episodes(envs, actions)

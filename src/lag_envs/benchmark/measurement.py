@@ -52,8 +52,8 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return its contents."""
     for name in settings.files:
         registered(name)
-    ours = settings.ids, settings.sizes, settings.keywords, settings.threads
-    rows = contestants(*ours) if settings.speed else []
+    selection = settings.ids, settings.sizes, settings.keywords, settings.threads
+    rows = contestants(*selection) if settings.speed else []
     if settings.speed and settings.energies:
         rows += of_energies(settings.sizes)
     times: dict[str, list[list[float]]] = {}

@@ -1,4 +1,4 @@
-"""The ratios and times that ours should reach, and whether they do."""
+"""The ratios and times that this package should reach, and whether it does."""
 
 from __future__ import annotations
 

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SECTION = "conservation"
-OURS = "lag_envs"
+LAG_ENVS = "lag_envs"
 EPS = 2.0**-53
 COLOURS = {
-    OURS: "#000000",
+    LAG_ENVS: "#000000",
     "RK4": "#0072b2",
     "implicit midpoint": "#009e73",
     "Verlet": "#56b4e9",
@@ -73,7 +73,7 @@ def jobs(quick: bool) -> list[ReportJob]:
             SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps}
         )
         for name in names
-        for method in (OURS, *(m for m in METHODS if m in COLOURS))
+        for method in (LAG_ENVS, *(m for m in METHODS if m in COLOURS))
     ]
     count = 50 if quick else 500
     return made + [
@@ -126,7 +126,7 @@ def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArr
     """Return the lifted states after these numbers of steps; fewer rows if a step was refused."""
     stepped = Stepped(problem.scene, dt=problem.dt)
     largest = stepped.largest_majorant(problem.dt)
-    if method != OURS:
+    if method != LAG_ENVS:
         stepped = Stepped(problem.scene, comparison(method, stepped.flow))
     out = np.empty((len(at) + 1, stepped.width))
     out[-1] = stepped.lift(np.array(problem.state))
@@ -135,7 +135,7 @@ def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArr
 
 
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
-    """Yield the drifts of a run without drag and drive, and for ours its error and the amplified rounding."""
+    """Yield the drifts of a run without drag and drive; for lag_envs also error and amplified rounding."""
     problem = FREE[name]
     scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
@@ -155,7 +155,7 @@ def free(name: str, method: str, steps: int) -> Iterator[Row]:
     size = np.maximum(abs(start["kinetic"]) + abs(start["potential"]), np.abs(energy["kinetic"]))
     row["energy"] = finite((energy["total"] - start["total"]) / size)
     yield row
-    if method == OURS:
+    if method == LAG_ENVS:
         yield growth(name, at.tolist(), states)
 
 
@@ -276,7 +276,7 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
         text=[TEXT[0].format(steps=steps), *TEXT[1:]],
         tables=_tables(drifts, grown, balances),
         pictures=list(_pictures(drifts, grown)),
-        claims=_claims([row for row in drifts if row["method"] == OURS], grown, balances, steps),
+        claims=_claims([row for row in drifts if row["method"] == LAG_ENVS], grown, balances, steps),
         summary=_summary(drifts, steps),
         details=[_all(drifts)],
     )
@@ -338,7 +338,7 @@ def _ratios(row: Row) -> list[float]:
     return (np.array(row["error"]) / (np.sqrt(steps) * np.array(row["amplified"]))).tolist()
 
 
-def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) -> list[Claim]:
+def _claims(own: list[Row], grown: list[Row], balances: list[Row], steps: int) -> list[Claim]:
     def claim(text: str, found: list[tuple[float | None, str]], limit: float) -> Claim:
         if not found:
             return Claim(text, None, "")
@@ -352,17 +352,17 @@ def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) 
         claim(
             f"On bar and shell energy drifts by less than {1e-17 * steps:.0e} of its size in {steps:,} steps,"
             " less than a tenth of a rounding per step.",
-            [(worst(row["energy"]), row["name"]) for row in ours if "length" in row],
+            [(worst(row["energy"]), row["name"]) for row in own if "length" in row],
             1e-17 * steps,
         ),
         claim(
             f"On the incline it drifts by less than {1e-16 * steps:.0e}, a rounding per step.",
-            [(worst(row["energy"]), row["name"]) for row in ours if "length" not in row],
+            [(worst(row["energy"]), row["name"]) for row in own if "length" not in row],
             1e-16 * steps,
         ),
         claim(
             "c² + s² stays within 1e-15 of 1.",
-            [(worst(row["length"]), row["name"]) for row in ours if "length" in row],
+            [(worst(row["length"]), row["name"]) for row in own if "length" in row],
             1e-15,
         ),
         claim(
@@ -406,8 +406,8 @@ def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[ReportFigure]:
     if any("length" in row for row in drifts):
         yield ReportFigure(
             "conservation-length",
-            "c² + s² - 1 of the cosine and sine that ours carries along, at the marks of each run.",
-            lambda: _lengths([row for row in drifts if row["method"] == OURS and "length" in row]),
+            "c² + s² - 1 of the cosine and sine that lag_envs carries along, at the marks of each run.",
+            lambda: _lengths([row for row in drifts if row["method"] == LAG_ENVS and "length" in row]),
         )
     if grown:
         yield ReportFigure(
@@ -433,14 +433,14 @@ def _panels(names: Sequence[str]) -> tuple[Figure, dict[str, Any]]:
 def _curves(rows: list[Row], x: str, y: str, xlabel: str, ylabel: str) -> Figure:
     names = list(dict.fromkeys(row["name"] for row in rows))
     figure, axes = _panels(names)
-    for row in sorted(rows, key=lambda row: row["method"] == OURS):
+    for row in sorted(rows, key=lambda row: row["method"] == LAG_ENVS):
         axis = axes[row["name"]]
         values = np.array([np.nan if v is None else abs(v) for v in row[y]])
         values = np.fmax.accumulate(np.maximum(values, 1e-17)) if len(values) else values
-        ours = row["method"] == OURS
+        own = row["method"] == LAG_ENVS
         axis.loglog(
-            row[x], values, color=COLOURS[row["method"]], lw=2.2 if ours else 1.1, label=row["method"],
-            zorder=3 if ours else 2,
+            row[x], values, color=COLOURS[row["method"]], lw=2.2 if own else 1.1, label=row["method"],
+            zorder=3 if own else 2,
         )  # fmt: skip
         axis.set_title(row["name"], fontsize=9)
         axis.set_ylim(1e-17, 1e3)
@@ -470,7 +470,7 @@ def _growths(rows: list[Row]) -> Figure:
     for row in rows:
         axis = axes[row["name"]]
         axis.loglog(
-            row["seconds"], np.maximum(row["error"], 1e-18), color="black", lw=1.8, label="error of ours"
+            row["seconds"], np.maximum(row["error"], 1e-18), color="black", lw=1.8, label="error of lag_envs"
         )
         axis.loglog(
             row["seconds"], row["amplified"], ":", color="#d55e00", lw=1.8, label="amplified rounding"

@@ -35,7 +35,7 @@ STYLES = {
     "MuJoCo implicitfast": ("#B8860B", "^", ":"),
     "MuJoCo RK4": ("#B8860B", "D", ":"),
 }
-OURS = {"lag_envs": ("*", 15), "lag_envs, one call": ("p", 11)}
+OWN_STYLES = {"lag_envs": ("*", 15), "lag_envs, one call": ("p", 11)}
 DARK = "#003B5C"
 ROUNDED = "amplified rounding"
 LOWEST = 1e-17
@@ -63,7 +63,7 @@ def draw_variant(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapp
         for ax in axes.flat
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    names = [name for name in (*OURS, *STYLES, ROUNDED) if name in known]
+    names = [name for name in (*OWN_STYLES, *STYLES, ROUNDED) if name in known]
     figure.legend(
         [known[n] for n in names], names, loc="outside lower center", ncols=6, fontsize=8.5, frameon=False
     )
@@ -84,9 +84,9 @@ def panel(ax: Axes, points: Sequence[WorkPrecisionPoint], floor: float | None) -
         _curve(
             ax, curve, label=name, color=colour, marker=marker, linestyle=line, linewidth=1.0, markersize=3.5
         )
-    for method, (marker, size) in OURS.items():
+    for method, (marker, size) in OWN_STYLES.items():
         _curve(
-            ax, [p for p in points if p.ours and p.method == method], label=method, marker=marker,
+            ax, [p for p in points if p.own and p.method == method], label=method, marker=marker,
             markersize=size, color=DARK, linestyle="", markeredgecolor="white", zorder=6,
         )  # fmt: skip
 
@@ -95,7 +95,7 @@ def curves(points: Sequence[WorkPrecisionPoint]) -> dict[str, list[WorkPrecision
     """Return a curve for each rival: of all forms of a method, the points that no other form beats."""
     found: dict[str, list[WorkPrecisionPoint]] = {}
     for p in points:
-        if not p.ours:
+        if not p.own:
             found.setdefault(p.name.partition(",")[0], []).append(p)
     return {
         name: sorted(

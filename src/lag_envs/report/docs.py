@@ -49,10 +49,10 @@ PARTS = (
     PagePart(
         "work_precision",
         "One step of the package's scenes",
-        "Bar, incline and shell have dedicated steps. Ours is as shipped, at rounding error; a rival is "
+        "Bar, incline and shell have dedicated steps. lag_envs is as shipped, at rounding error; a rival is "
         "given the scene's own equation and its fastest form, with the setting that just reaches an "
-        "error. Only ours has a bound on its error before the step. The table names the fastest rival "
-        "for each error, with its time as a multiple of ours: below 1 the rival is faster.",
+        "error. Only lag_envs has a bound on its error before the step. The table names the fastest rival "
+        "for each error, with its time as a multiple of that of lag_envs: below 1 the rival is faster.",
         (),
     ),
     PagePart(
@@ -268,9 +268,9 @@ look).
 It also writes a page with all rows as CSV and JSON."""
 
 FIRST = (
-    "Only ours has a bound on its error that is known before or with the step. The errors of the others were "
-    "found afterwards, from exact solutions.",
-    "On the left, ours is at rounding error. A coarser setting would not be faster, so there is one point.",
+    "Only lag_envs has a bound on its error that is known before or with the step. The errors of the others "
+    "were found afterwards, from exact solutions.",
+    "On the left, lag_envs is at rounding error. A coarser setting would not be faster, so it has one point.",
 )
 
 

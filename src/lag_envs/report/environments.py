@@ -1,4 +1,4 @@
-"""The error of whole episodes: every environment of ours, and those of the same kind in Gymnasium.
+"""The error of whole episodes: every environment of lag_envs, and those of the same kind in Gymnasium.
 
 An episode is recorded as it comes out of ``gym.make``: its float64 states, and the controls that were
 applied. `episodes` compares it with the exact one, `gymnasium_peers` has Gymnasium's equations, and
@@ -68,7 +68,9 @@ def jobs(quick: bool) -> list[ReportJob]:
     free: list[dict[str, Any]] = [{"id": id} for id in ("", *UNDRIVEN)]
     if not quick:
         free.insert(1, {"id": "", "dt": 0.02})
-    names = [f"{f['id'] or 'ours'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free]
+    names = [
+        f"{f['id'] or 'lag_envs'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free
+    ]
     return made + [
         ReportJob(SECTION, name, "environments:undriven", arguments)
         for name, arguments in zip(names, free, strict=True)
@@ -94,7 +96,7 @@ def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[R
 
 
 def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool = False) -> Row:
-    """Return the row of an episode of ours; if asked, computed twice, with the difference of the two."""
+    """Return the row of an episode of lag_envs; if asked, computed twice, with the difference of the two."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
         return exact_states(task, seed, start, episode.controls, digits)
@@ -112,7 +114,7 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
         )
     order = order_of(task.scene, task.dt)
     row |= {
-        "ours": True,
+        "own": True,
         "integrator": f"Taylor series, order {order}" if order else "exact flow",
         "entries": entry_errors(row.pop("each"), task.scene.state_names, task.scene.state_units),
     }
@@ -142,7 +144,7 @@ UNDRIVEN: dict[str, tuple[dict[str, float], Any]] = {
     "Pendulum-v1": ({}, np.zeros(1, np.float32)),
     "CartPole-v1": ({"force_mag": 0.0}, 0),
 }
-#: Makes an environment of ours with Pendulum-v1's equation of motion: a rod of 1 m and 1 kg.
+#: Makes an environment of lag_envs with Pendulum-v1's equation of motion: a rod of 1 m and 1 kg.
 TWIN: dict[str, Any] = {
     "mass": 1.0,
     "com_distance": 0.5,
@@ -153,9 +155,9 @@ TWIN: dict[str, Any] = {
 
 
 def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
-    """Yield a row of a pendulum without control, released at rest: a peer's, or ours with the same equation.
+    """Yield a row of an undriven pendulum, released at rest: Gymnasium's, or one with the same equation.
 
-    ``dt`` is our control step [s], by default that of Pendulum-v1.
+    ``dt`` is the control step of lag_envs [s], by default that of Pendulum-v1.
 
     ``gain`` is the relative growth of energy above rest in 100 s.
     """

@@ -128,7 +128,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
 
 
 def system_rivals(family: str, quick: bool) -> list[Rival]:
-    """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
+    """Return a family's methods at all settings; lag_envs is among the compiled ones."""
     some: slice = slice(-1, None, -5) if quick else slice(None)
     if family == "heyoka":
         methods = ("Taylor",) if quick else ("Taylor", Heyoka.NARROW)
@@ -136,14 +136,14 @@ def system_rivals(family: str, quick: bool) -> list[Rival]:
     if family in ENGINES:
         kind = ENGINES[family]
         return [kind(method, n) for method, found in kind.settings.items() for n in found[some]]
-    ours = [
+    certified_series = [
         CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
         for tolerance in TOLERANCES[some]
         for order in ORDERS[some]
     ]
     others = [CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in SUBSTEPS[method][some]]
     return [
-        *ours,
+        *certified_series,
         *others,
         *(CompiledRadau(CompiledRadau.METHOD, n) for n in SUBSTEPS[CompiledRadau.METHOD][some]),
     ]
@@ -264,7 +264,7 @@ def shares(attempts: Sequence[int]) -> Row:
 
 
 def first_step_seconds(name: str, rounds: int) -> Iterator[Row]:
-    """Yield the seconds until the first step: ours with an empty and a filled cache, heyoka's compilation."""
+    """Yield the seconds until the first step: with an empty and a filled cache, and heyoka's."""
     system = SYSTEMS[name]
     state, control = (x[0].tolist() for x in system.draw(1))
     script = FIRST.format(scene=system.scene, state=state, control=control, dt=DT)
@@ -310,7 +310,7 @@ def _heyoka(system: System, mode: str) -> float:
 def energy(quick: bool) -> Iterator[Row]:
     """Yield how far the energy of undamped double pendulums drifts, relative to its range.
 
-    Ours over the whole path, the others at the end.
+    lag_envs over the whole path, the others at the end.
     """
     scene = SYSTEMS["double pendulum, driven"].scene
     count, steps = (1, 500) if quick else (4, round(LONG / DT))

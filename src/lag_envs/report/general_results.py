@@ -41,14 +41,14 @@ class BestSetting(NamedTuple):
 
 def setting_label(row: Row) -> str:
     """Return a setting in words."""
-    if row["family"] in ("ours", "heyoka"):
+    if row["family"] in ("lag_envs", "heyoka"):
         return f"{row['method'].removeprefix('lag_envs, ')}, {row['setting']:g}"
     return f"{row['method']}, {row['setting']:g} substep{'s' if row['setting'] > 1 else ''}"
 
 
 def column_name(row: Row) -> str:
     """Return a point's column: compiled methods have one each."""
-    if row["family"] == "ours":
+    if row["family"] == "lag_envs":
         return "lag_envs"
     if row["family"] == "compiled":
         return f"{row['method']}, compiled"
@@ -59,7 +59,7 @@ def column_name(row: Row) -> str:
 OTHERS = (
     ("other libraries", ("heyoka", "MuJoCo", "Pinocchio")),
     (
-        "fixed-step methods without a bound, compiled like ours",
+        "fixed-step methods without a bound, compiled like lag_envs",
         ("RK4, compiled", "DOP853, compiled", "Radau IIA, compiled"),
     ),
 )
@@ -69,13 +69,13 @@ COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
 def best_settings(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, BestSetting]]:
     """Return, by system, mode and error, the quickest setting of each column.
 
-    Times are in units of ours in one job, by the clock of every job. A method without a batch counts there as
-    it does alone.
+    Times are in units of lag_envs's in one job, by the clock of every job. A method without a batch counts
+    there as it does alone.
     """
     points = [r for r in rows if r["kind"] == "point" and "ns" in r and r["error"] is not None]
     clocks: dict[tuple[str, str], float] = {}
     for r in points:
-        if r["family"] == "ours":
+        if r["family"] == "lag_envs":
             clocks.setdefault((r["system"], r["mode"]), r["clock"])
     found: dict[tuple[str, str, float], dict[str, BestSetting]] = {}
     for r in points:
@@ -121,13 +121,13 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "compilation does not. Samples are taken in turn, and times are medians of processor time. The "
             "errors are those of the timed calls, at the fastest setting that reaches the given "
             "error.",
-            "Ours certifies each step, at a tolerance and an order. The others give no bound: which "
+            "lag_envs certifies each step, at a tolerance and an order. The others give no bound: which "
             "setting reaches an error is known here only from the exact ends. heyoka runs with fast_math, "
             "without compact "
             "mode, its compiled step in a compiled loop, in a batch in blocks of two widths. MuJoCo runs its "
             "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
             "algorithm in RK4 steps in a C++ loop. For both, a driven support is a field in its frame. RK4, "
-            "DOP853 and Radau IIA take fixed steps and are compiled like ours.",
+            "DOP853 and Radau IIA take fixed steps and are compiled like lag_envs.",
             *([f"Not compared: {', '.join(missing)}."] if missing else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
@@ -179,24 +179,24 @@ def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> T
     for (system, of, target), here in found.items():
         if of != mode or "lag_envs" not in here:
             continue
-        others, ours = _others(here), here["lag_envs"]
-        ratio = others[0][0] / ours.ns if others else None
+        others, own = _others(here), here["lag_envs"]
+        ratio = others[0][0] / own.ns if others else None
         rows.append((
-            system, f"{target:g}", round(ours.ns, 1), ours.label, *(_cell(here, name) for name in COLUMNS),
+            system, f"{target:g}", round(own.ns, 1), own.label, *(_cell(here, name) for name in COLUMNS),
             ratio, f"{others[0][1]}: {here[others[0][1]].label}" if others else None,
         ))  # fmt: skip
     return Table(
         f"general-times-{mode}",
         f"CPU time of a control step [ns] {MODES[mode]}, each at its quickest setting whose worst error is "
-        "below the one given; the ratio is that of the quickest other to ours, below 1 where the other is "
-        "faster",
+        "below the one given; the ratio is that of the quickest other to lag_envs, below 1 where the other "
+        "is faster",
         (
             "system",
             "error",
             "lag_envs",
             "order, tolerance",
             *COLUMNS,
-            "quickest other / ours",
+            "quickest other / lag_envs",
             "quickest other",
         ),
         rows,
@@ -216,7 +216,7 @@ def _summary(found: Mapping[tuple, Mapping[str, BestSetting]]) -> Table | None:
     return Table(
         "general-summary",
         f"Scenes defined by energies alone: CPU time of a control step of {DT:g} s [ns], each at its "
-        f"quickest setting whose worst error from {MEMBERS} harsh states is below the one given; ours is "
+        f"quickest setting whose worst error from {MEMBERS} harsh states is below the one given; lag_envs is "
         "certified, the others give no bound (`lag-envs report`)",
         ("system", "error", "lag_envs", "in a batch", *COLUMNS[:5], "heyoka in a batch"),
         rows,
@@ -258,7 +258,7 @@ def _fastest(
             lost.append(f"{name} by {here['lag_envs'].ns / ns:.2f} ({system}, {target:g})")
     told = f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else "")
     return Claim(
-        f"Ours reaches each error in less time than {who}, {MODES[mode]}.",
+        f"lag_envs reaches each error in less time than {who}, {MODES[mode]}.",
         not lost if cases else None,
         told if cases else "",
     )
@@ -314,8 +314,8 @@ def _first(rows: Sequence[Row]) -> Table:
     kinds = ("cold", "cached", "heyoka, single", "heyoka, batch")
     return Table(
         "general-first",
-        "CPU seconds until the first step, without imports: ours from energies to a step, with an empty and "
-        "with a filled cache of compiled code; heyoka's compilation at tolerance 1e-15",
+        "CPU seconds until the first step, without imports: lag_envs from energies to a step, with an empty "
+        "and with a filled cache of compiled code; heyoka's compilation at tolerance 1e-15",
         ("system", "lag_envs, cold", "lag_envs, cached", "heyoka", "heyoka, batch"),
         [(name, *(median(of[k]) if k in of else None for k in kinds)) for name, of in found.items()],
     )
@@ -325,7 +325,7 @@ def _energy(rows: Sequence[Row]) -> Table:
     return Table(
         "general-energy",
         "Energy of undamped double pendulums: largest drift, relative to its height above the lowest "
-        "energy; ours over the whole time, the others at the end",
+        "energy; lag_envs over the whole time, the others at the end",
         ("method", "seconds", "drift"),
         [
             (r["method"], r["seconds"], "lost" if r["drift"] is None else r["drift"])

@@ -1,4 +1,4 @@
-"""Gymnasium's environments of the same kind as ours: scenes with their equations, and their episodes.
+"""Gymnasium's environments of the same kind as lag_envs's: scenes with their equations, and their episodes.
 
 A test checks on Gymnasium's own steps that the scenes have the equations of its source.
 """
@@ -116,7 +116,7 @@ def measure_peer(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row
     ]
     row = episode_errors(episode, path, shifted, alone, dt, peer.wraps)
     return row | {
-        "ours": False,
+        "own": False,
         "integrator": peer.integrator,
         "entries": entry_errors(row.pop("each"), *peer.described(env)),
     }

@@ -1,4 +1,4 @@
-"""Control steps of an energy-defined scene as problems for every rival; ours is one of them."""
+"""Control steps of an energy-defined scene as problems for every method, lag_envs included."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class CertifiedSeries(Rival):
     batch the block function of the vector environments, both over one control step from each state.
     """
 
-    family = "ours"
+    family = "lag_envs"
 
     @staticmethod
     def method_of(order: int) -> str:

@@ -220,7 +220,7 @@ def exact_steps(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Arr
 
 
 def step_points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
-    """Yield errors and times of ours and the usual integrators."""
+    """Yield errors and times of lag_envs and the usual integrators."""
     s = subject(file, name)
     starts, controls, truth = exact_steps(s, quick)
     if not len(starts):
@@ -228,19 +228,21 @@ def step_points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]
     copies = max(1, 1024 // len(starts))
     problems = SceneProblems(s.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)))
     some: slice = slice(-1, None, -3) if quick else slice(None)
-    ours: list[Rival] = [
+    compiled_here: list[Rival] = [
         CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
         for tolerance in TOLERANCES[some]
         for order in ORDERS[some]
     ]
-    ours += [
+    compiled_here += [
         CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]
     ]
-    ours += [CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]]
+    compiled_here += [
+        CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]
+    ]
     others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
     clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
     for mode in general_results.MODES:
-        for rivals in (ours, others):
+        for rivals in (compiled_here, others):
             yield from general.timed_rivals(
                 problems, truth, rivals, clock, mode, 3 if quick else 7, {"system": name}, s.dt
             )

@@ -1,4 +1,4 @@
-"""The methods to compare: ours, and rivals of any kind behind one interface, each in its fastest form.
+"""The methods to compare: lag_envs, and rivals of any kind behind one interface, each in its fastest form.
 
 A `Rival` is built for some `Problems` and a time over which their controls are held. It then runs, and is
 timed, in one call for all of them over the whole time: in compiled loops if it has them, on blocks of states
@@ -38,7 +38,7 @@ class Rival(ABC):
         A tolerance, or for methods that are `fixed` the substeps per control step; 1/4 is one step for four.
     """
 
-    #: Where it comes from: a package's name, "compiled", or "ours".
+    #: Where it comes from: a package's name, "compiled", or "lag_envs".
     family: ClassVar[str]
 
     def __init__(self, method: str, setting: float) -> None:
@@ -101,7 +101,7 @@ class ShippedStepping(Rival):
     The setting is the number of steps per control step: for another accuracy, users choose another `dt`.
     """
 
-    family = "ours"
+    family = "lag_envs"
     METHOD = "lag_envs"  #: control step by control step, like an environment
     ONE_CALL = "lag_envs, one call"  #: the whole time as one step, which `simulate` divides by the bound
 
@@ -148,7 +148,7 @@ class ShippedStepping(Rival):
 
 
 class CompiledMethod(Rival):
-    """An integrator of `METHODS`, compiled like ours: with the same recorder, compiler and vector width.
+    """An integrator of `METHODS`, compiled like lag_envs: with the same recorder, compiler and vector width.
 
     Coefficients are precomputed, so that only the method is timed. Alone: one compiled loop over steps and
     trajectories. In a batch: one compiled loop over blocks of states.

@@ -17,9 +17,9 @@ from lag_envs.report.stability_maps import MAPS
 from lag_envs.report.stability_results import (
     DIVERGED,
     FAR_OFF,
+    LAG_ENVS,
     MOST_SUBSTEPS,
     NO_REFERENCE,
-    OURS,
     PEERS,
     REFUSED,
     TOO_LONG,
@@ -75,11 +75,11 @@ def map_errors(map: str, name: str, dt: float, values: Sequence[float]) -> Itera
     for i, (x, case) in enumerate(zip(values, found, strict=True)):
         row: Row = {"kind": "cell", "map": map, "name": name, "dt": dt, "x": x}
         row |= largest_errors(case, dt, {key: end[i] for key, end in ends.items()})
-        error = row["errors"][OURS]
+        error = row["errors"][LAG_ENVS]
         if error == DIVERGED or (isinstance(error, float) and error > EXACT):
             row["substeps"] = extremes.substeps(case, dt)
             try:
-                row["roundings"] = _roundings(case, dt, ends[OURS][i])
+                row["roundings"] = _roundings(case, dt, ends[LAG_ENVS][i])
             except ArithmeticError as problem:
                 row["problem"] = error_line(problem)
         yield row
@@ -132,10 +132,11 @@ def largest_errors(case: Case, dt: float, ends: dict[str, Any]) -> Row:
 def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
     """Return each method's end state for each case, or the reason why there is none.
 
-    Keys are names; ", 16" is added for 16 steps in place of one, ", float32" for that arithmetic. "ours" is
-    the shipped step; "ours, float32" is the formula of its series, with the substeps that the bound requires.
+    Keys are names; ", 16" is added for 16 steps in place of one, ", float32" for that arithmetic. "lag_envs"
+    is the shipped step; "lag_envs, float32" is the formula of its series, with the substeps that the bound
+    requires.
     """
-    ends: dict[str, list[Any]] = {OURS: [_ours(case, dt) for case in found]}
+    ends: dict[str, list[Any]] = {LAG_ENVS: [_shipped(case, dt) for case in found]}
     flow = Stepped(found[0].scene, dt=dt).flow
     with np.errstate(all="ignore"):
         for precision, dtype in PRECISIONS.items():
@@ -149,13 +150,13 @@ def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
         counts = np.array([_count(case, dt) for case in found])
         short = np.minimum(counts, MOST_SUBSTEPS)
         rows = step_cases(flow.fast, found, dt, np.where(counts > MOST_SUBSTEPS, 1, short), np.float32)
-    ends[f"{OURS}, float32"] = [
+    ends[f"{LAG_ENVS}, float32"] = [
         TOO_LONG if n > MOST_SUBSTEPS else row for n, row in zip(counts, rows, strict=True)
     ]
     return ends
 
 
-def _ours(case: Case, dt: float) -> Any:
+def _shipped(case: Case, dt: float) -> Any:
     try:
         return case.scene.simulate(case.state, [case.control], dt)[-1].tolist()
     except (StepRefused, ValueError):

@@ -1,4 +1,4 @@
-"""A scene in its normal form together with a flow that steps it: ours, or one for comparison."""
+"""A scene in its normal form together with a flow that steps it: the shipped one, or one for comparison."""
 
 from __future__ import annotations
 

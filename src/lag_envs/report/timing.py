@@ -34,7 +34,7 @@ class FlowSteps:
     scene : Scene
         Its zero constants decide the code; problems on the same kind of scene share it.
     flow : Flow, optional
-        Ours for steps of `dt`, or a comparison integrator.
+        The shipped one for steps of `dt`, or a comparison integrator.
     dt : float
         Control step [s].
 

@@ -77,7 +77,7 @@ def control_step(variant: str) -> float:
 
 
 def jobs(quick: bool) -> list[ReportJob]:
-    """Return the jobs: references, then points of ours and of the usual integrators, then of libraries."""
+    """Return the jobs: references, then points of lag_envs and the usual integrators, then of libraries."""
     names = QUICK_VARIANTS if quick else tuple(VARIANTS)
     horizons = QUICK if quick else HORIZONS
     made = [
@@ -203,19 +203,19 @@ def state_errors(some: Sequence[ExactEnd], ends: Array) -> Row:
 
 
 def variant_rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
-    """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
+    """Return a family's methods at all settings; lag_envs is among the compiled ones."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
         equation = Problems(problems(variant, horizon, ensemble(variant, 1))).equation
         methods = [m for m in CompiledMethod.methods(equation) if not quick or m in QUICK_METHODS]
-        ours = [ShippedStepping(ShippedStepping.METHOD, 1)]
+        shipped = [ShippedStepping(ShippedStepping.METHOD, 1)]
         if plan.seconds is not None:  # a constant control may be stepped with any dt
-            ours += [
+            shipped += [
                 *(ShippedStepping(ShippedStepping.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)),
                 ShippedStepping(ShippedStepping.ONE_CALL, 1),
             ]
         return [
-            *ours,
+            *shipped,
             *(CompiledMethod(method, n) for method in methods for n in plan.substeps),
         ]
     kind = peers.PEERS[family]
@@ -281,7 +281,7 @@ def point(
     members = [t.case for t in some]
     # If states share their steps, errors are from a batch as large as the timed one.
     cases = [*members, *base[len(members) :]] if together and rival.shared else members
-    if rival.family != "ours":
+    if rival.family != "lag_envs":
         few = cases if together else cases[:1]
         expected = _seconds(rival, few, dt, steps, together) * len(cases) / len(few)
         if expected > LIMIT:
@@ -357,7 +357,7 @@ class OrderedMethod(NamedTuple):
 
 
 def series(scene: Scene, quick: bool = False) -> list[OrderedMethod]:
-    """Return all methods that have an order: ours at several orders, and the usual integrators."""
+    """Return all methods that have an order: lag_envs at several orders, and the usual integrators."""
     found, flow = [], Stepped(scene).flow
     if flow.order:
         found = [

@@ -192,7 +192,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
+        """Return the request not to unroll a loop: these are short, and long code compiles slowly."""
         module = self._b.module
         unrolled = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         off = ir.Constant(_BIT, 0)
