@@ -13,7 +13,7 @@ environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 ``start(f, d, k)`` sets an episode's start, from one draw for each entry of state and target
 ``lift(f, k)``     computes what the formulas need besides the state: call it after setting the state by hand
 ``move(f, a, k)``  takes a step: control, motion, reward, ending
-``kick(f, d, k)``  applies the random disturbance after the step
+``kick(f, d, k)``  applies the random kick after the step
 ``observe(f, k)``  computes the observation
 ``poses(f, p, k)`` computes the poses of the picture's frames: x, y, angle and part of each
 =================  ==========================================================================================

@@ -47,7 +47,7 @@ class _ChainTask(Support):
         kicked = self.largest_kick * math.sqrt(0.5 * about_joint) * self.limit
         return (math.sqrt(turning + fall) + pushed + kicked) * math.sqrt(2.0 / scene.inertia)
 
-    def push(self, draws: Any, xp: Any) -> dict[str, Any]:
+    def occasional_kick(self, draws: Any, xp: Any) -> dict[str, Any]:
         """Return an occasional kick of the last bar's rate to either side."""
         size = self.largest_kick * (2.0 * draws[1] - 1.0)
         return {f"{self.angles[-1]}_dot": xp.where(draws[0] < self.chance(self.kick_chance), size, 0.0)}
@@ -448,7 +448,7 @@ alone works only if the bars happen to pass upright slowly.
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Change the last bar's rate, now and then."""
-        return self.push(draws, xp)
+        return self.occasional_kick(draws, xp)
 
 
 class Balance(_ChainTask):
@@ -624,7 +624,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Change the last bar's rate, now and then."""
-        return self.push(draws, xp)
+        return self.occasional_kick(draws, xp)
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return s, s', the angles from upright, and their rates."""
