@@ -116,7 +116,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
 
 
 def suits(algo: str, task: Task) -> bool:
-    """Tell whether a learner supports a task's kind of actions: discrete or continuous."""
+    """Return whether a learner supports a task's kind of actions: discrete or continuous."""
     choices = bool(task.formulas.choices)
     return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
 
@@ -451,7 +451,7 @@ class LearnedPolicy:
 
 
 def numbered(hyper: dict[str, Any]) -> bool:
-    """Tell whether a wrapper numbers the actions."""
+    """Return whether a wrapper numbers the actions."""
     return any(DISCRETISE in wrapper for wrapper in hyper.get("env_wrapper", []))
 
 

@@ -74,7 +74,7 @@ A task with plans (`Task.plans`) is planned instead, by iLQR from random guesses
                 a plan that is followed from any start by feedback; of those found, the one with the best
                 mean return over 200 fresh starts
   src/lag_envs/controllers/plans/ID-quick.npz
-                a quicker one, from which each episode is planned anew
+                a quicker one, from which each episode is replanned
   src/lag_envs/tasks/measured.json
                 what both get, by python -m agents.scale: means over fresh starts with standard errors; the
                 best of them is the best known, a lower bound

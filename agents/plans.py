@@ -37,7 +37,7 @@ def find_plans(env_id: str, folder: Path | None = None, seeds: Iterable[int] = S
     """Find an environment's plans, and write them to the place where controllers read them, or into a folder.
 
     One plan is followed from any start: the one with the best mean return over fresh starts. The other is the
-    best initial guess if each episode is planned anew. A task that follows another's plans has none of its
+    best initial guess if each episode is replanned. A task that follows another's plans has none of its
     own.
     """
     task, began = TASKS[env_id](), time.monotonic()

@@ -146,7 +146,7 @@ class Run:
                 )
 
     def foreign(self) -> bool:
-        """Tell whether the folder holds files that are not the run's."""
+        """Return whether the folder holds files that are not the run's."""
         found = self.folder.iterdir() if self.folder.exists() else ()
         return any(f.name != "tensorboard" and not f.name.endswith(".part") for f in found)
 

@@ -68,7 +68,7 @@ def task(file, tmp_path, monkeypatch):
 
 @pytest.fixture
 def scaled(task, tmp_path, monkeypatch):
-    """Measure its score scale into a file, and have the file read."""
+    """Measure its score scale, write it to a file, and let the package read that file."""
     monkeypatch.setattr(scale, "BATCH", 200)
     path = tmp_path / "measured.json"
     assert scale.main([ID, "--batches", "1", "--output", str(path)]) == 0

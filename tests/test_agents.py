@@ -74,7 +74,7 @@ def test_adapter_equals_dummy_vec_env(env_id, options):
             else:
                 assert a == {}
     assert sum(ends.values()) >= 6
-    # Without seeds a reset goes on with the next episodes.
+    # Without seeds a reset continues with the next episodes.
     assert adapter.reset().tobytes() == dummy.reset().tobytes()
 
 

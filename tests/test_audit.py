@@ -273,7 +273,7 @@ LOG = {
 
 @needs_git
 @pytest.mark.parametrize("how", LOG)
-@pytest.mark.parametrize("chain", [False, True], ids=["by hand", "with the chain made anew"])
+@pytest.mark.parametrize("chain", [False, True], ids=["by hand", "with the chain rebuilt"])
 def test_the_log_is_edited(board, how, chain):
     before = board.log.read_bytes()
     told = lines(board)

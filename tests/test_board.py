@@ -343,7 +343,7 @@ def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
     joined = board.read().protocols[1]
     assert set(joined.scales) == set(protocol.boards()) and joined.rules.model_dump() == protocol.rules()
     assert joined.references.keys() == {id for id in protocol.boards() if protocol.reference(id)}
-    assert states(board) == {old: "verified"}  # nothing is verified anew
+    assert states(board) == {old: "verified"}  # nothing is verified again
     assert board_data(board, "today")["environments"][0] == shown
     other = add(board, env=new, nonce="2")
     assert states(board) == {old: "verified", other: "verified"}

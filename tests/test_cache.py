@@ -89,7 +89,7 @@ def test_a_damaged_file_is_dropped_with_one_warning(place, how):
     for path in files(place):
         DAMAGE[how](path)
         assert cache.damage(path)
-    with pytest.warns(RuntimeWarning, match="damaged: .*compiled anew") as told:
+    with pytest.warns(RuntimeWarning, match="damaged: .*compiled again") as told:
         assert (hits(), hits("other source")) == (0, 0)
     assert len(told) == 1
     assert (hits(), hits("other source")) == (1, 1)

@@ -154,7 +154,7 @@ def test_plans_are_kept_outside(observations):
     _, other = agent.predict(second)  # another episode in between
     follow, later = agent.predict(first, state)
     np.testing.assert_array_equal(follow, agent.predict(first, state)[0])
-    # New episodes are planned again, the others go on.
+    # New episodes are planned again, the others continue.
     _, mixed = agent.predict(np.stack([first[0], second[1]]), later, np.array([False, True]))
     assert mixed.step.tolist() == [3, 1]
     np.testing.assert_array_equal(mixed.actions[0], state.actions[0])

@@ -64,7 +64,7 @@ def plain(text):
 
 
 def agrees(stated, value):
-    """Tell whether a stated number is the value, rounded to the printed digits."""
+    """Return whether a stated number is the value, rounded to the printed digits."""
     digits = len(stated.partition(".")[2])
     return abs(float(stated) - value) <= 0.5001 * 10.0**-digits + 1e-6 * abs(value)
 
@@ -414,10 +414,12 @@ def test_generated_parts_are_as_generated():
     """Pages and README's tables are generated from the JSON files beside them, and from the records."""
     for path, text in generated(ROOT).items():
         assert path.read_text(encoding="utf-8") == text, (
-            f"{path.name}: `python -m lag_envs.report.docs` writes it anew"
+            f"{path.name}: `python -m lag_envs.report.docs` writes it again"
         )
     for path, text in from_records(ROOT).items():
-        assert path.read_text(encoding="utf-8") == text, f"{path.name}: `python -m tools.docs` writes it anew"
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name}: `python -m tools.docs` writes it again"
+        )
 
 
 def test_speeds():

@@ -149,7 +149,7 @@ def test_single_precision_is_the_step_to_its_rounding(id):
 
 
 def test_what_cannot_be_stepped_is_cut_off():
-    """The state is kept, others go on, and the next episode begins as after any other end."""
+    """The state is kept, others continue, and the next episode begins as after any other end."""
     envs = on_processor(FREE, 4, damping=0.0)
     envs.reset(seed=1)
     envs.rows[1, 1] = 1e9  # too fast for any number of substeps

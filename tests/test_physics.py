@@ -22,7 +22,7 @@ SCENES = (PivotedBar, Incline, CylinderInCylinder)
 
 
 def vanishes(expression):
-    """Tell whether an expression, rational but for sines and cosines, is identically zero."""
+    """Return whether an expression, rational but for sines and cosines, is identically zero."""
     expression = sympy.numer(sympy.together(sympy.nsimplify(expression))).expand()
     for cosine in expression.atoms(cos):
         expression = expression.subs(cosine**2, 1 - sin(*cosine.args) ** 2).expand()

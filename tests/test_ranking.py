@@ -212,7 +212,7 @@ def test_the_reference_has_its_own_mean_and_the_error_of_that():
 @pytest.mark.parametrize("policies", [1, 5])
 @pytest.mark.parametrize("part", [0.0, 0.5, 1.0, 2.0])
 def test_every_interval_holds_the_error_of_the_references_mean(part, policies):
-    """To the extent that a row was corrected by it, whatever the row."""
+    """In proportion to the row's correction by the reference, for any row."""
     rng = np.random.default_rng(2)
     luck = rng.normal(0.0, 50.0, (policies, 1000))
     noise = rng.normal(0.0, 3.0, (policies, 1000))
@@ -293,7 +293,7 @@ def test_means_of_references_are_those_of_the_controllers(env_id):
 
 
 def test_combined_scores_by_hand():
-    """Clipped to [0, 1], missing boards are 0, boards without anybody do not count."""
+    """Clipped to [0, 1], a missing board counts 0, and boards without agents do not count."""
     alice, bob = AgentIdentity("A", ("Alice",)), AgentIdentity("A", ("Bob",))
     steady = np.linspace(0.0, 1.0, 1001)
     boards = {

@@ -280,7 +280,7 @@ def test_page_and_figures_of_any_results(tmp_path):
     text = (tmp_path / results.PAGE).read_text()
     assert text == report.agents_page(data) and "nan" not in text
     assert "| a\\|b | 9.90 ± 0.20 | 0.990 (0.950, 1.030) |" in text
-    # What a learner had stands beside whatever it is said to reach.
+    # Scores are shown with the seeds and steps that a learner was given.
     assert "| ppo, 5 seeds of 1,000 steps | " in text and "| td3, 1 seed of 1,000 steps | " in text
     assert re.search(r"\| sac\+ \| .* \| 3 \| 1,000 \|", text)
     assert "Left out:" in text and "sac+" in text
@@ -358,7 +358,7 @@ def test_fewer_episodes_are_told():
 
 
 def test_how_agents_act_is_what_is_committed():
-    """One learner and one controller of it, played anew."""
+    """A learner and a controller, played again."""
     kept = json.loads(behaviour.OUTPUT.read_text())
     assert set(kept["envs"]) <= set(TASKS) and kept["episodes"] == behaviour.EPISODES
     found = behaviour.behaviour_of(ENV)

@@ -483,7 +483,7 @@ def test_text_with_something_wrong(folder, old, new, reason):
         ('squash = "clip"', 'squash = "no"', "squash: Input should be '"),
         ('squash = "clip"', "bins = 1", "bins: Input should be greater than or equal to 2"),
         ('squash = "clip"', "bins = 1000000", "bins: Input should be "),
-        ('squash = "clip"', 'squash = "clip"\nbins = 3', "squash means nothing beside bins; leave it out"),
+        ('squash = "clip"', 'squash = "clip"\nbins = 3', "squash has no effect with bins; leave it out"),
         ('squash = "clip"', 'squash = "clip"\nmean_limit = nan', "mean_limit: Input should be "),
         ('squash = "clip"', 'squash = "clip"\nnormalise = {clip = 0}', "clip: Input should be "),
         ('squash = "clip"', 'squash = "clip"\nnormalise = {mean = 0}', "mean is an unknown key"),

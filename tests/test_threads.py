@@ -30,7 +30,7 @@ def made(threads, n=MANY, env_id=ID, **options):
 
 
 def digest(envs, steps, seed=3):
-    """Return a digest of all results of so many steps; with a seed, after a reset."""
+    """Return a digest of all results of this many steps; with a seed, after a reset."""
     found = hashlib.sha256()
     if seed is not None:
         found.update(envs.reset(seed=seed)[0].tobytes())

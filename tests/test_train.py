@@ -87,7 +87,7 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
         cut = make_run(tmp_path / "cut", algo, normalize=True)
         content = cut.load_checkpoint()
         model = learners.thaw(cut, content)
-        # Weights, optimiser, normalisation and memory are restored, and learning goes on.
+        # Weights, optimiser, normalisation and memory are restored, and training continues.
         normalise, buffer = pickle.loads(content["normalisation"]), pickle.loads(content["buffer"])
         assert model.get_vec_normalize_env().obs_rms.mean.tolist() == normalise.obs_rms.mean.tolist()
         assert (buffer is None) == (algo == "ppo") and model.num_timesteps == cut.trained

@@ -37,7 +37,7 @@ def in_every_mode(of=features):
 
 
 def lasting(env_id, steps):
-    """Return the keyword that limits episodes to so many of the task's own steps."""
+    """Return the keyword that limits episodes to this many of the task's own steps."""
     return {"duration": min(steps, TASKS[env_id].steps) * TASKS[env_id].interval}
 
 

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def go(run, until=10**9):
-    """Train until so many steps are done; return whether the run is finished."""
+    """Train until this many steps are done; return whether the run is finished."""
 
     def show(run):
         if until <= run.trained < run.steps:

@@ -21,7 +21,7 @@ GUIDE = "docs/tutorial.md and examples/ball_on_beam.py show how"
 
 
 def is_file(name: str) -> bool:
-    """Tell whether a name on the command line is a file rather than an id.
+    """Return whether a name on the command line is a file rather than an id.
 
     Examples
     --------

@@ -189,7 +189,7 @@ def wrappers(kind):
 
 
 def fails_alike(error, wrapper, mode, tensors):
-    """Tell whether Gymnasium's own Pendulum-v1 fails inside a wrapper in the same way."""
+    """Return whether Gymnasium's own Pendulum-v1 fails inside a wrapper in the same way."""
     try:
         envs = gym.make_vec(
             "Pendulum-v1", 3, "sync", vector_kwargs={"autoreset_mode": mode}, render_mode="rgb_array",

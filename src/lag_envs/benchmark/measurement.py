@@ -37,7 +37,7 @@ class BenchmarkSettings:
     jacobians: bool = False  #: also the cost of a step's derivatives
     divisions: bool = False  #: also how often the certificate divides steps
     sizes: tuple[int, ...] = (1, 64, 1024, 16384)
-    threads: int = 1  #: if more than 1, also batches stepped by so many
+    threads: int = 1  #: if more than 1, also batches stepped by this many
     rounds: int = 31
     seconds: float = 0.05  #: target length of one sample
     clock: str = "wall"  #: or "cpu", which leaves out the time of other programs on the core

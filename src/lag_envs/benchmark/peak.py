@@ -21,7 +21,8 @@ from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
 from lag_envs.stepping.compiling import compile_function, count_operations
 
-#: Numbers, few enough for the nearest cache, and multiply-adds on each: enough that loads do not matter.
+#: How many numbers, few enough for the nearest cache, and multiply-adds on each, so many that loads do not
+#: matter.
 NUMBERS, TIMES = 1024, 12
 PRODUCTS = frozenset({"*", "a*b+c", "a*b-c", "c-a*b"})
 
@@ -41,7 +42,7 @@ def _compiled() -> Callable:
 
 
 def peak() -> Callable[[int], int]:
-    """Return a function that does at least so many multiply-adds on each number and returns their number."""
+    """Return a function that does at least this many multiply-adds on each number, and counts them."""
     multiply_adds, numbers = _compiled(), on_a_line(np.ones(NUMBERS))
 
     def run(count: int) -> int:

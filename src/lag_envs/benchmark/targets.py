@@ -30,7 +30,7 @@ class SpeedTarget(NamedTuple):
         return size if self.id is None else f"{self.id}, {size}"
 
     def meant_for(self, row: dict[str, Any]) -> bool:
-        """Tell whether the target applies to a row of a report."""
+        """Return whether the target applies to a row of a report."""
         if (row["kind"], row["num_envs"]) != (self.kind, self.num_envs):
             return False
         if self.id is not None:
@@ -56,7 +56,7 @@ COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
 @cache
 def has_own_flow(env_id: str) -> bool:
-    """Tell whether an environment is stepped by its scene's dedicated flow alone."""
+    """Return whether an environment is stepped by its scene's dedicated flow alone."""
     return env_id in TASKS and not TASKS[env_id].imperfections and form_of(TASKS[env_id]().scene) is not None
 
 

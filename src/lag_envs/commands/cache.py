@@ -33,7 +33,7 @@ def run_cache(args: argparse.Namespace) -> int:
         ("writable", "yes" if cache.writable(place) else "no: each process compiles what is not here"),
     ]
     damaged = [(str(entry.path), why) for entry in kept if (why := cache.damage(entry.path))]
-    rows += [("damaged", str(len(damaged)) + (", compiled anew when used next:" if damaged else ""))]
+    rows += [("damaged", str(len(damaged)) + (", compiled again when used next:" if damaged else ""))]
     print("\n".join(aligned(rows) + aligned([("  " + path, why) for path, why in damaged])))
     return 0
 

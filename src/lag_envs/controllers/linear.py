@@ -191,7 +191,7 @@ class Regulator(FeedbackController):
 
 
 class BalanceLQR(FeedbackController):
-    """Keep bodies on a moving support upright by a linear-quadratic regulator, in spite of kicks.
+    """Keep bodies on a moving support upright by a linear-quadratic regulator, despite kicks.
 
     The reward alone would make the control as hard as possible; the added weights keep the regulator ready
     for the next kick. ``python -m agents.tune`` found them.

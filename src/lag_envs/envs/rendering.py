@@ -273,7 +273,7 @@ class Viewer:
     # --- real time ------------------------------------------------------------------------------------------
 
     def _is_due(self) -> bool:
-        """Tell whether to show this step: if steps are faster than the window, only some are shown."""
+        """Return whether to show this step: if steps are faster than the window, only some are shown."""
         now = time.perf_counter()
         self._due += self._task.dt
         if not now - 0.25 < self._due:
@@ -393,7 +393,7 @@ class Pen:
         self._middle = 0.5 * width, 0.5 * (height - strip)
         self._shapes = [x for x in picture.shapes if not isinstance(x[1], s.Magnifier)]
         self._lenses = [x for x in picture.shapes if isinstance(x[1], s.Magnifier)] if glass is None else []
-        #: Rulers' outlines depend on the view and are made anew for each picture.
+        #: Rulers' outlines depend on the view and are rebuilt for each picture.
         self._outlines = [self._outline(shape) for _, shape in self._shapes]
         self._room = np.zeros((height, width + 2))
         self._plane = len(picture.frames)

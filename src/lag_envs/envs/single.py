@@ -383,7 +383,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, and compile anew (from the cache)."""
+        """Restore, and compile again (from the cache)."""
         self.__dict__.update(state)
         self._program = program_of(self.task, [numbers_of(self.task)])
         self._bind()

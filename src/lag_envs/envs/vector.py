@@ -614,7 +614,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, and compile anew (from the cache)."""
+        """Restore, and compile again (from the cache)."""
         self.__dict__.update(state)
         sharing.forget_helpers(self._ids, self.num_envs)
         self._compile()

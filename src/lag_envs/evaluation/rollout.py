@@ -144,7 +144,7 @@ class Meter:
         self.show(self.done + self.taken, self.total)
 
     def close(self, size: int) -> None:
-        """Count a roll-out that ended early, or was left out, as one of so many steps."""
+        """Count a roll-out that ended early, or was left out, as one of this many steps."""
         self.done, self.taken = self.done + size, 0
         self.show(self.done, self.total)
 

@@ -51,7 +51,7 @@ FAR = Distance(2.0, 1e9)
 
 @dataclass
 class PlayedPolicy:
-    """Where a policy went in the common episodes, and what it did and got.
+    """A policy's states, actions and returns in the common episodes.
 
     Parameters
     ----------

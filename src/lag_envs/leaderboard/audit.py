@@ -125,7 +125,7 @@ class CheapChecks:
     abouts: dict[str, About] = field(default_factory=dict)
 
     def chained(self, number: int) -> bool:
-        """Tell whether a line of the log holds the hash of the lines before it."""
+        """Return whether a line of the log holds the hash of the lines before it."""
         return any(line.number == number and line.event.prev is not None for line in self.lines)
 
 
@@ -295,7 +295,7 @@ def _odd(found: CheapChecks, entry: BoardEntry, result: Mapping[str, Any]) -> It
     seeds = {label: replay["reset_seed"] - first for label, replay in recorded.items()}
     if seeds != chosen or len(result["replays"]) > len(seeds):
         yield "has recorded other episodes than the median, the best and the worst"
-    elif result.get("build") is not None:  # before, those of random actions were drawn anew
+    elif result.get("build") is not None:  # before, those of random actions were redrawn
         for label, i in chosen.items():
             if abs(recorded[label]["return"] - returns[i]) > 1e-3 * max(1.0, abs(returns[i])):
                 yield f"has recorded another {label} episode than was verified"
@@ -508,7 +508,7 @@ def _load(board: Board, entry: BoardEntry) -> Any:
 
 
 def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
-    """Play the recorded episodes of each policy again, and some more that nobody can foresee."""
+    """Play the recorded episodes of each policy again, and some more that cannot be foreseen."""
     from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import record_again
@@ -556,7 +556,7 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
 
 
 def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
-    """Tell whether two episodes are the same, to the digits that are recorded."""
+    """Return whether two episodes are the same, to the digits that are recorded."""
     if any(len(kept[name]) != len(made[name]) for name in ("states", "actions", "rewards")):
         return False
     if any(kept[name] != made[name] for name in ("seed", "reset_seed", "dt", "target")):

@@ -323,7 +323,7 @@ class Board:
 
     @contextmanager
     def claimed(self, id: str) -> Iterator[bool]:
-        """Tell whether nobody else is verifying a submission, and keep others from it meanwhile."""
+        """Return whether a submission is free to verify, and lock it if so."""
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
         with ExitStack() as stack:
             try:
@@ -352,7 +352,7 @@ def current(state: BoardState, what: str) -> Protocol:
 
 
 def others(state: BoardState, entry: BoardEntry) -> list[BoardEntry]:
-    """Return all submissions verified on the same board, whatever became of them."""
+    """Return all submissions verified on the same board, including those withdrawn or replaced since."""
     return [
         other
         for other in state.boards[entry.protocol].values()

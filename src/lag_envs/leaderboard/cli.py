@@ -275,7 +275,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _remark(row: dict[str, Any]) -> str:
-    """Return what sets a row apart, in words."""
+    """Describe what distinguishes a row."""
     remarks = []
     if row["alike"]:
         remarks.append(f"acts like {row['alike']['id']}")

@@ -84,7 +84,7 @@ class LoggedScale(Strict):
 
 
 class LoggedReference(Strict):
-    """The controller that plays everybody's episodes, its mean return, and that mean's standard error."""
+    """The controller that plays the same episodes as the submissions, its mean return and its error."""
 
     controller: Name
     mean: Number
@@ -478,7 +478,9 @@ def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
     for old in [*event.supersedes, *(like.id for like in event.alike)]:
         other = state.entries.get(old)
         if other is None or old == event.id or not other.sha256 or other.env != known.env:
-            raise ValueError(f"{event.id} is verified beside {old}, which is no other result of its board")
+            raise ValueError(
+                f"{event.id} is verified in place of {old}, which is not another result of its board"
+            )
     state.entries[event.id] = replace(
         known, state="verified", nonce=event.nonce, sha256=event.sha256, alike=tuple(event.alike)
     )
@@ -490,7 +492,7 @@ def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
 
 
 def same_agent(entry: BoardEntry, other: BoardEntry) -> bool:
-    """Tell whether two are the same authors' of the same name, on the same board."""
+    """Return whether two are the same authors' of the same name, on the same board."""
     return (entry.env, entry.name, sorted(entry.authors)) == (other.env, other.name, sorted(other.authors))
 
 

@@ -66,7 +66,7 @@ class NetworkTable(PolicyTable):
     def _fit(self) -> Self:
         given = self.model_fields_set & {"squash", "mean_limit"}
         if self.bins and given:
-            raise ValueError(f"{min(given)} means nothing beside bins; leave it out")
+            raise ValueError(f"{min(given)} has no effect with bins; leave it out")
         return self
 
 
@@ -98,7 +98,7 @@ class Network(Architecture):
     counts_as = "learned"
 
     def _layers(self, task: Task, table: NetworkTable, wide: int, features: int) -> None:
-        """Read the table and set the arrays of layers that take so many `features`.
+        """Read the table and set the arrays of layers that take this many `features`.
 
         Observations to normalise have length `wide`.
         """
@@ -137,8 +137,8 @@ class MLP(Network):
 
     In the table: `hidden`, the layers' widths, none for a linear map; `activation`; `squash`, "clip" or
     "tanh"; `mean_limit`, optional, to which the last layer's output is clipped before squashing (the mean
-    under SAC's gSDE); `bins`, instead of squashing: [-1, 1] is cut into so many equal parts, the network has
-    an output for each, and the largest output chooses the centre of its part; and the table ``normalise``
+    under SAC's gSDE); `bins`, instead of squashing: [-1, 1] is cut into this many equal parts, the network
+    has an output for each, and the largest output chooses the centre of its part; and the table ``normalise``
     with `epsilon` and `clip`: then the network sees (o - obs_mean)/√(obs_var + epsilon), clipped. If actions
     are listed, the network has an output for each value of each list, the largest of which chooses, and there
     is no `squash`, `mean_limit` or `bins`.

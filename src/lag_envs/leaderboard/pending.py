@@ -49,7 +49,7 @@ class PendingCheck:
 
 
 def claimed(submission: About) -> dict[str, Any]:
-    """Return a submission's statements about itself, which nobody verified."""
+    """Return a submission's unverified statements about itself."""
     training = submission.training
     return {
         "code": submission.code or None,

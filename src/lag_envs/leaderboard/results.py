@@ -63,7 +63,7 @@ class ClaimedCurve(Strict):
 
 
 class Claimed(Strict):
-    """A submission's statements about itself, which nobody verified."""
+    """A submission's unverified statements about itself."""
 
     code: Text | None
     license: Text

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def page_data(board: Board) -> dict[str, Any]:
-    """Return `board_data` and what only the page needs: agents that run there, drives by hand."""
+    """Return `board_data` and what only the page needs: agents that run there, and human drives."""
     from lag_envs.leaderboard.drives import best_drives
     from lag_envs.leaderboard.site.driving import agent
     from lag_envs.leaderboard.submission import load

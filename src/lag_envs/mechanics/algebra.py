@@ -124,7 +124,7 @@ class Expr:
         return hash(self.text)
 
     def same(self, other: Expr) -> bool:
-        """Tell whether two expressions have the same terms."""
+        """Return whether two expressions have the same terms."""
         return self.terms == other.terms
 
     @property

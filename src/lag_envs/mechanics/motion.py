@@ -230,7 +230,7 @@ def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Colle
 
 
 def _is_hard(expr: Expr, name: str) -> bool:
-    """Tell whether a parameter occurs in a denominator or in a function."""
+    """Return whether a parameter occurs in a denominator or in a function."""
     return any(
         n < 0 and atom.name == name if atom.argument is None else parameter(name) in atom.argument.symbols()
         for monomial in expr.terms

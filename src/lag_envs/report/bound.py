@@ -184,7 +184,7 @@ def _enough(
     exact: Sequence[mpf],
     limits: Sequence[float],
 ) -> bool:
-    """Tell whether n substeps, in float64, reach the required accuracy."""
+    """Return whether n substeps, in float64, reach the required accuracy."""
     h = dt / n
     y: Any = theta, omega, math.cos(theta), math.sin(theta)
     for i in range(n):

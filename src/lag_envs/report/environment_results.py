@@ -112,7 +112,7 @@ def _ratio(row: Row) -> float:
 
 
 def _is_general(row: Row) -> bool:
-    """Tell whether an environment of lag_envs is stepped by the general series."""
+    """Return whether an environment of lag_envs is stepped by the general series."""
     return form_of(TASKS[row["case"]]().scene) is None
 
 

@@ -124,8 +124,8 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
 def peer_episode(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
     """Yield rows of one of Gymnasium's environments under random actions.
 
-    CartPole-v1 falls within half a second; a second row goes on to 10 s, by its own update, as if it had not
-    ended.
+    CartPole-v1 falls within half a second; a second row continues to 10 s, by its own update, as if it had
+    not ended.
     """
     seconds = seconds or {"Acrobot-v1": 100.0}.get(id, 10.0)
     steps = round(seconds / PEERS[id].step(gym.make(id, disable_env_checker=True).unwrapped))

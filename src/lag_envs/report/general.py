@@ -1,4 +1,4 @@
-"""Scenes defined by energies alone: error against time beside other engines, certificates, energy.
+"""Scenes defined by energies alone: error against time compared with other engines, certificates, energy.
 
 Each system takes one control step from the same harsh states, with every joint turning fast at once. All
 rivals run in compiled loops, many states in one call, and the errors are those of the timed calls. Other
@@ -213,7 +213,7 @@ def worst_and_median(found: Array, truth: tuple[Array, Array]) -> tuple[float | 
 
 
 def again(sample: Sample, least: int = 10_000) -> Sample:
-    """Return a quick sample, repeated from its start until it has at least so many steps."""
+    """Return a quick sample, repeated from its start until it has at least this many steps."""
     sample.end()
     begin = process_time()
     sample.end()

@@ -1,4 +1,4 @@
-"""Gymnasium's environments of the same kind as lag_envs's: scenes with their equations, and their episodes.
+"""Gymnasium's counterparts of this package's environments: scenes with their equations, and episodes.
 
 A test checks on Gymnasium's own steps that the scenes have the equations of its source.
 """
@@ -81,7 +81,7 @@ PEERS = {
 def record_peer(
     env: Any, peer: GymnasiumPeer, actions: Iterator[Any], steps: int, to_the_end: bool
 ) -> RecordedEpisode:
-    """Record at most so many steps of a peer that has been reset; until its termination, or past it."""
+    """Record at most this many steps of a peer that has been reset; until its termination, or past it."""
     states, controls, terminated = [np.array(env.state, np.float64)], [], False
     for action in itertools.islice(actions, steps):
         controls.append(peer.control(env, action))

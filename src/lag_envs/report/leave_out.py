@@ -30,7 +30,7 @@ BATCH = 1024
 
 
 class ScenePair(NamedTuple):
-    """A scene without something, and the same one with it; a control step of both, from the same state."""
+    """A scene without a feature and with it, and a control step of both from the same state."""
 
     left_out: str
     without: Scene | Stepped

@@ -84,7 +84,7 @@ class System:
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
         """Return harsh random states and controls, one row each; prescribed coordinates start at 0.
 
-        Every joint turns at up to its full speed, all of them at once.
+        All joints turn at once, each at up to its full speed.
         """
         rng = np.random.default_rng(seed)
         states = np.zeros((count, len(self.scene.state_names)))

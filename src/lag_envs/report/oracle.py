@@ -232,7 +232,7 @@ class Precision(NamedTuple):
 
 
 def agreed(compute: Callable[[int], list[mpf]], digits: int) -> list[mpf]:
-    """Return a result with at least so many digits, once two such computations agree.
+    """Return a result with at least this many digits, once two such computations agree.
 
     Raises
     ------
@@ -292,7 +292,7 @@ class Oracle:
         return expression.xreplace(self._values)
 
     def _constants(self, formulas: OperationList, bits: int) -> list:
-        """Return the constants of formulas as balls with so many bits, or as floats for 0 bits."""
+        """Return the constants of formulas as balls with this many bits, or as floats for 0 bits."""
         key = id(formulas), bits
         if key not in self._bound:
             exact = [self.exactly(e) for e in formulas.constants]
@@ -390,7 +390,7 @@ class Oracle:
         return agreed(lambda working: self.once(state, controls, dt, working), digits)
 
     def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
-        """Return the end state from one computation whose steps keep so many digits."""
+        """Return the end state from one computation whose steps keep this many digits."""
         for what, given, names in (
             ("state", state, self.names.state),
             ("controls", control_list(controls), self.names.controls),

@@ -73,7 +73,7 @@ class Subject(NamedTuple):
 
 
 def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
-    """Return the states of episodes under random actions, after so many steps or before their end."""
+    """Return the states of episodes under random actions, after this many steps or before their end."""
     env = LagrangianEnv(task)  # type: ignore[arg-type]
     env.action_space.seed(seed)
     states = []
@@ -155,7 +155,7 @@ def subject(file: str, name: str) -> Subject:
 
 
 def jobs(quick: bool, file: str = "") -> list[ReportJob]:
-    """Return the jobs: errors and certificate, stability, then all that is timed."""
+    """Return the jobs: errors and certificate, stability, then everything that is timed."""
     if not file:
         return []
     path = Path(own_files.split_path(file)[0])

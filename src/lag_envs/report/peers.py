@@ -37,7 +37,7 @@ class LibraryRival(Rival):
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Tell whether it can step a scene."""
+        """Return whether it can step a scene."""
         return True
 
     @property
@@ -458,7 +458,7 @@ class MuJoCo(LibraryRival):
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Tell whether there is a model of the scene."""
+        """Return whether there is a model of the scene."""
         return any(kind in MODELS for kind in type(scene).__mro__)
 
     @property

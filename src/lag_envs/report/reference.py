@@ -22,7 +22,7 @@ from lag_envs.store import write_file
 Array = NDArray[np.float64]
 #: Folder in which the exact ends are kept; None keeps nothing.
 store: Path | None = None
-#: An undamped pendulum that moves through more than about so many radians uses elliptic functions.
+#: An undamped pendulum that moves through more than about this many radians uses elliptic functions.
 FAR = 5.0
 
 
@@ -32,7 +32,7 @@ def _pendulum(oracle: Oracle, controls: tuple[float, ...]) -> tuple[Any, Any] | 
 
 
 def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: int) -> list[mpf]:
-    """Return the state after a time dt, from one computation with so many digits."""
+    """Return the state after a time dt, from one computation with this many digits."""
     held = control_list(controls)
     if known := _pendulum(oracle, tuple(map(float, held))):
         (_, speed), (alpha, beta) = oracle.start(state, held, float), known

@@ -153,7 +153,7 @@ class FlowSteps:
 
 
 class Sample(NamedTuple):
-    """A sample to time: `run` does so many control steps, after `prepare`, which is not timed."""
+    """A sample to time: `run` does this many control steps, after `prepare`, which is not timed."""
 
     run: Callable[[], object]
     steps: int

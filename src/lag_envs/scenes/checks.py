@@ -68,7 +68,7 @@ def real_array(name: str, values: ArrayLike) -> Array:
 
 
 def is_masked(values: Any) -> bool:
-    """Tell whether values are or hold a masked array; NumPy would take masked numbers for valid ones."""
+    """Return whether values are or hold a masked array; NumPy would take masked numbers for valid ones."""
     if isinstance(values, list | tuple):
         return any(map(is_masked, values))
     return isinstance(values, np.ndarray) and hasattr(values, "mask")

@@ -33,7 +33,7 @@ _admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[SceneLayout, Mechan
 
 
 def is_own(kind: type) -> bool:
-    """Tell whether a class is the package's own: then its structure alone decides its formulas' results.
+    """Return whether a class is the package's own: then its structure alone decides its formulas' results.
 
     Other people's formulas may use names defined outside, which can change.
     """

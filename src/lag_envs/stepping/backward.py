@@ -1,11 +1,11 @@
-"""The step of `lag_envs.stepping.series` backwards: gradients by its end as gradients by its start.
+"""The step of `lag_envs.stepping.series` backwards: from gradients by its end to gradients by its start.
 
-The series that ends a control step is at hand, those of earlier substeps are expanded once more. Then the
-recurrences are gone through from the highest order to the lowest. Each is a relation that is linear in the
-coefficient it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent
-P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
-Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them where the series has one. Lengths of
-substeps are held.
+The series that ends a control step is still available; those of earlier substeps are expanded again. Then the
+recurrences are traversed from the highest order to the lowest. Each is a relation that is linear in the
+coefficient that it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The
+cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
+Σ_{k>j} P_k B_{k-j} that of A_j. So an order costs two of them where the series has one. The lengths of the
+substeps are held fixed.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Numba's own cache trusts its files. A file that lost a byte to a full disk, a killed process or an editor
 causes an error deep inside pickle or LLVM, or runs as it is. Here a file begins with a key of what it was
-compiled from and a digest of its content. A file that does not match is dropped and compiled anew. If the
+compiled from and a digest of its content. A file that does not match is dropped and compiled again. If the
 cache cannot be written to, nothing is kept.
 """
 
@@ -100,7 +100,7 @@ def damage(path: Path) -> str:
 
 
 def writable(place: Path) -> bool:
-    """Tell whether files can be kept in a folder, which need not exist yet."""
+    """Return whether files can be kept in a folder, which need not exist yet."""
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=place):
@@ -324,7 +324,7 @@ def _warn(path: Path, error: Damaged) -> None:
     if not _warned:
         _warned = True
         warnings.warn(
-            f"compiled code in {path} is damaged: {error}; it is dropped and compiled anew. "
+            f"compiled code in {path} is damaged: {error}; it is dropped and compiled again. "
             "`lag-envs cache` looks for more, `lag-envs cache --clear` drops all",
             RuntimeWarning,
             stacklevel=2,

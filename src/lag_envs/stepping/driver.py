@@ -59,7 +59,7 @@ def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-d
 
 
 def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
-    """Go on with the lanes that are not done, side by side; return how many were refused."""
+    """Continue with the lanes that are not done, side by side; return how many were refused."""
     rows = memory[base + bounds * BLOCK :]  # the last row has the lanes' numbers
     going = refused = 0
     for i in range(count):

@@ -113,7 +113,7 @@ class Machine:
         return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
 
     def most(self, condition: Any, of: Any) -> ir.Value:
-        """Tell whether a condition holds in at least two thirds of the lanes in which another holds."""
+        """Return whether a condition holds in at least two thirds of the lanes in which another holds."""
         kind = ir.IntType(self._lanes)
         count, total = (self._b.zext(self._b.ctpop(self._b.bitcast(x, kind)), _INT) for x in (condition, of))
         three, two = ir.Constant(_INT, 3), ir.Constant(_INT, 2)

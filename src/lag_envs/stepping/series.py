@@ -43,7 +43,7 @@ SMALLEST_ORDER, LARGEST_ORDER = 4, 24
 TOLERANCE = 1e-14
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
-#: While a control that lags is still far from its command, a substep is at most so many time constants.
+#: While a control that lags is still far from its command, a substep is at most this many time constants.
 REACH = 2.0
 #: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
 STRIDE = LARGEST_ORDER + 3
@@ -541,7 +541,7 @@ class Series:
         """Take a certified step of length h, or of as much of h as can be certified from one expansion.
 
         Coefficients of a shorter step are those of h times powers of their ratio: so nothing is computed
-        anew.
+        again.
 
         Parameters
         ----------
@@ -618,7 +618,7 @@ class Series:
     def substep(
         self, t: Target, inputs: dict[str, Any], lane: StepProgress, dt: Any, order: Any, tolerance: Any
     ) -> tuple[StepProgress, list]:
-        """Go on with a control step dt of which something is left, by what one expansion gives.
+        """Continue with a control step dt of which something is left, by what one expansion gives.
 
         Returns
         -------
@@ -753,7 +753,7 @@ class Certificate:
       said of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where
       w is z, A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
 
-    Each holds for partial sums too, as the proof needs: the coefficient k of the left-hand side takes from
+    Each holds for partial sums too, as the proof requires: the coefficient k of the left-hand side takes from
     its own series what is below k only.
     """
 
@@ -771,7 +771,7 @@ class Certificate:
         self._measure()
 
     def check(self, part: Any = None, power: Any = None) -> tuple[Any, list]:
-        """Tell whether the step, or a part of it, is certified, and return the bounds on what v leaves out.
+        """Return whether the step, or a part of it, is certified, and return the bounds on what v leaves out.
 
         A part f < 1 makes Σ' |x_k| at most f times as large, and overlaps, sums of orders from N on, f^N
         times.

@@ -223,7 +223,7 @@ good, because all starts are close together.
         return self.height(after, xp) ** 4 - 0.02 * (effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether each bar is within 0.2 rad of upright."""
+        """Return whether each bar is within 0.2 rad of upright."""
         lowest = xp.cos(after[self.angles[0]])
         for name in self.angles[1:]:
             lowest = xp.maximum(lowest, xp.cos(after[name]))
@@ -612,7 +612,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
         return 1.0 - squares * (0.5 / self.scene.bars) - 0.5 * (s * s)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether a bar has fallen or the support has left the track."""
+        """Return whether a bar has fallen or the support has left the track."""
         over = xp.abs(after.s) > self.scene.track
         for e in self.leaning(after).values():
             over = over | (xp.abs(e) > self.largest_angle)

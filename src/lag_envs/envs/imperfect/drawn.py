@@ -1,4 +1,4 @@
-"""Parameters that are drawn anew for each episode."""
+"""Parameters that are redrawn for each episode."""
 
 from __future__ import annotations
 

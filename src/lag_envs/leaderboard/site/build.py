@@ -324,7 +324,7 @@ def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
 
 
 def rounded_text(value: Any, digits: int = 3) -> str:
-    """Return a number with so many digits after the point, fewer for large numbers.
+    """Return a number with this many digits after the point, fewer for large numbers.
 
     Examples
     --------

@@ -154,7 +154,7 @@ def _made(kind: type[Task], values: Mapping[str, float], marks: Sequence[float])
 
 
 def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
-    """Tell whether a script with changed parameters does the same as tasks made with them."""
+    """Return whether a script with changed parameters does the same as tasks made with them."""
     others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
     return bool(others) and all(_steps_as(env, list(values), other) for other in others)
 
@@ -170,7 +170,7 @@ def _look(task: Task) -> dict[str, Any]:
 
 
 def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
-    """Tell whether a script with another task's parameters does the same as that task."""
+    """Return whether a script with another task's parameters does the same as that task."""
     if other.formulas.key != env.task.formulas.key or other.limit != env.task.limit:
         return False
     changed, own = Unfused(env.task, env.program), Unfused(other)
