@@ -27,12 +27,14 @@ from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.checks import SMALLEST_LAG
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.stepping import driver, general
+from lag_envs.stepping.certificate import Certificate
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.driver import compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
 from lag_envs.stepping.machine import LaneLayout
-from lag_envs.stepping.series import REACH, Certificate, Plain, Series
+from lag_envs.stepping.series import REACH, Series
+from lag_envs.stepping.target import Plain
 from lag_envs.stepping.tracing import evaluate_operations
 
 #: Error of a control step, relative to the entry or to 1.

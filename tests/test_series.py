@@ -26,6 +26,7 @@ from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import Chain, StepRefused
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import compiling, driver, general, machine
+from lag_envs.stepping.certificate import SMALLEST_SIZE, Certificate
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
@@ -34,14 +35,12 @@ from lag_envs.stepping.machine import LaneLayout, compile_attempt
 from lag_envs.stepping.series import (
     LARGEST_ORDER,
     SMALLEST_ORDER,
-    SMALLEST_SIZE,
     TOLERANCE,
     TRIES,
-    Certificate,
-    Plain,
     Series,
     StepProgress,
 )
+from lag_envs.stepping.target import Plain
 from lag_envs.stepping.tracing import evaluate_operations
 
 NAMES = [system.name for system in SYSTEMS]

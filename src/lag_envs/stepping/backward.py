@@ -14,16 +14,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
-from lag_envs.stepping.series import (
-    GROUP,
-    STRIDE,
-    ExpansionStart,
-    Factor,
-    Series,
-    StepProgress,
-    Target,
-    matrix_times,
-)
+from lag_envs.stepping.matrices import matrix_times
+from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress
+from lag_envs.stepping.target import GROUP, Target
 
 
 class Backward(Series):
@@ -47,20 +40,20 @@ class Backward(Series):
         del self.slots  # more series are needed than for the step
         for i in range(self.size):
             self._slot("a", i)
-        for n in self._live:
+        for n in self.live:
             node = record.nodes[n]
             if node.op == "sum":
                 for a, w in zip(node.args, node.weights, strict=False):
                     if w in self._active:
-                        self._factor(a)
-        self.slots = len(self._slots)
+                        self.factor_of(a)
+        self.slots = len(self.slot_of)
         #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to
         #: which several orders add, or which are known, and so wanted at the end.
-        self._sums = {key: self.slots + i for i, key in enumerate(self._pairs)}
-        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self._pairs.values() if a.back}
+        self._sums = {key: self.slots + i for i, key in enumerate(self.pairs)}
+        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self.pairs.values() if a.back}
         kept = [
             slot
-            for (kind, i), slot in self._slots.items()
+            for (kind, i), slot in self.slot_of.items()
             if kind == "v" or slot in rates or self._is_known(kind, i)
         ]
         self._bars = {slot: first + i for i, slot in enumerate(kept)}
@@ -165,19 +158,19 @@ class Backward(Series):
         for name, bar in weights.items():
             slope = self.record.tangents[name].get(source, 0.0)
             if slope != 0.0:
-                total = t.fma(bar, self._weight(t, start.scalars, slope), total)
+                total = t.fma(bar, self.weight(t, start.scalars, slope), total)
         return total
 
     # --- cotangents in memory ------------------------------------------------------------------------------
 
     def _bar(self, kind: str, i: int) -> int:
-        return self._bars[self._slots[kind, i]]
+        return self._bars[self.slot_of[kind, i]]
 
     def _clear(self, t: Target, order: Any) -> None:
         zero = t.number(0.0)
 
         def clear(k: Any, carried: Sequence) -> list:
-            for (kind, _), slot in self._slots.items():
+            for (kind, _), slot in self.slot_of.items():
                 if kind == "x" and slot in self._bars:
                     t.store(self._bars[slot], k, zero)
             return []
@@ -206,7 +199,7 @@ class Backward(Series):
         To those that are kept in slots it is added there.
         """
         found: dict[Factor, Any] = {}
-        pairs = list(self._pairs.items())
+        pairs = list(self.pairs.items())
         for begin in range(0, len(pairs), GROUP):
             some = pairs[begin : begin + GROUP]
 
@@ -237,7 +230,7 @@ class Backward(Series):
         step = t.mul(h, t.reciprocal(after))
         a, bars = [], []
         for i in range(self.size):
-            slot = self._slots["a", i]
+            slot = self.slot_of["a", i]
             a.append(t.load(slot, k))
             v_bar = t.load(self._bar("v", i), after)
             own = found.get(Factor(slot))
@@ -255,13 +248,13 @@ class Backward(Series):
         record, first = self.record, t.index(0)
         found = self._gather(t, k, order)
         bars: dict[int, Any] = {}
-        for n in self._live:
-            slot = self._slots.get(("x", n), -1)
+        for n in self.live:
+            slot = self.slot_of.get(("x", n), -1)
             if slot in self._bars and record.nodes[n].op not in KNOWN:
                 bars[n] = t.load(self._bars[slot], k)
             elif Factor(slot) in found:
                 bars[n] = found[Factor(slot)]
-            if ("d", n) in self._slots and (bar := found.get(Factor(self._slots["d", n]))) is not None:
+            if ("d", n) in self.slot_of and (bar := found.get(Factor(self.slot_of["d", n]))) is not None:
                 more = t.mul(t.real(k), bar)
                 bars[n] = t.add(bars[n], more) if n in bars else more
 
@@ -277,18 +270,18 @@ class Backward(Series):
             if node < 0:
                 continue
             for i, j in {(a, b), (b, a)}:
-                rate, factor = Factor(self._slots["a", j]), self._factor(node)
+                rate, factor = Factor(self.slot_of["a", j]), self.factor_of(node)
                 less = t.neg(right[i])
                 if weight in self._active:
                     self._weight_bar(t, weight, less, self._product(t, k, factor, rate))
                 if weight != 1.0:
-                    less = t.mul(less, self._weight(t, start.scalars, weight))
+                    less = t.mul(less, self.weight(t, start.scalars, weight))
                 add(node, less, rate.load(t, first))
                 t.store(self._sums[i, j], k, less)
-        for n in reversed(self._live):
+        for n in reversed(self.live):
             if n in bars:
                 self._node_back(t, start, n, bars[n], h, k, add)
-            elif n in self._pairs:
+            elif n in self.pairs:
                 t.store(self._sums[n], k, t.number(0.0))
 
     def _node_back(
@@ -301,12 +294,12 @@ class Backward(Series):
             step = t.mul(h, t.reciprocal(k))
             self._add(t, self._bar("v", node.index), t.plus(k, -1), step, bar)
         elif op == "velocity" or op in KNOWN:
-            self._add(t, self._bars[self._factor(n).slot], k, bar, t.number(1.0))
+            self._add(t, self._bars[self.factor_of(n).slot], k, bar, t.number(1.0))
         elif op == "sum":
             for a, weight in zip(args, node.weights, strict=False):
-                add(a, bar, self._weight(t, start.scalars, weight))
+                add(a, bar, self.weight(t, start.scalars, weight))
                 if weight in self._active:
-                    self._weight_bar(t, weight, bar, self._factor(a).load(t, k))
+                    self._weight_bar(t, weight, bar, self.factor_of(a).load(t, k))
         elif op == "product":
             add(args[0], bar, zero[args[1]])
             add(args[1], bar, zero[args[0]])
@@ -321,7 +314,7 @@ class Backward(Series):
             t.store(self._sums[n], k, t.neg(half))
         else:  # k z_k = Σ_{j>0} D_j w_{k-j}
             assert op in FUNCTIONS
-            slope = self._slope(n)
+            slope = self.slope_of(n)
             bar = t.neg(bar) if op == "cos" else bar
             scaled = t.mul(t.reciprocal(k), bar)
             if slope.back:  # D is h times the argument's rate
@@ -349,7 +342,7 @@ class Backward(Series):
         record, zero, first, n = self.record, start.zero, t.index(0), self.size
         gathered = self._gather(t, first, order, first=True)
         bars: dict[int, Any] = {}
-        for (kind, i), slot in self._slots.items():
+        for (kind, i), slot in self.slot_of.items():
             if kind == "x" and slot in self._bars:
                 bars[i] = t.load(self._bars[slot], first)
             elif kind == "x" and Factor(slot) in gathered:
@@ -368,12 +361,12 @@ class Backward(Series):
             bar = t.load(*self._cell(t, place))
             self._weight_bar(t, constant, bar, one)
             if entry >= 0:
-                add(bars, entry, bar, self._weight(t, start.scalars, weight))
+                add(bars, entry, bar, self.weight(t, start.scalars, weight))
                 self._weight_bar(t, weight, bar, zero[entry])
         for i in reversed(range(len(record.nodes))):
             node = record.nodes[i]
             op, args = node.op, node.args
-            if op in KNOWN and ("x", i) in self._slots:
+            if op in KNOWN and ("x", i) in self.slot_of:
                 power = h
                 for k, w in enumerate(node.weights[1:], 1):
                     self._weight_bar(t, w, power, t.load(self._bar("x", i), t.index(k)))
@@ -388,7 +381,7 @@ class Backward(Series):
             elif op == "sum":
                 self._weight_bar(t, node.weights[-1], bar, one)
                 for a, w in zip(args, node.weights, strict=False):
-                    add(bars, a, bar, self._weight(t, start.scalars, w))
+                    add(bars, a, bar, self.weight(t, start.scalars, w))
                     self._weight_bar(t, w, bar, zero[a])
             elif op == "product":
                 add(bars, args[0], bar, zero[args[1]])

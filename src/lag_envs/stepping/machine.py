@@ -14,7 +14,18 @@ from numba import types
 from numba.extending import intrinsic
 
 from lag_envs.mechanics import algebra
-from lag_envs.stepping import backward, dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping import (
+    backward,
+    certificate,
+    dual,
+    elementary,
+    lowering,
+    matrices,
+    primitives,
+    series,
+    target,
+    tracing,
+)
 from lag_envs.stepping.backward import Backward
 from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.dual import DualTarget
@@ -227,7 +238,7 @@ class Machine:
         return phis
 
     def elementary(self, name: str, x: Any) -> ir.Value:
-        operations, result = series.elementary(name, self._fused)
+        operations, result = target.elementary(name, self._fused)
         return emit(self._b, operations, {"x": x})[result]
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
@@ -237,7 +248,10 @@ class Machine:
 @cache
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
-    modules = (algebra, backward, dual, elementary, lowering, primitives, series, tracing)
+    modules = (
+        *(algebra, backward, certificate, dual, elementary, lowering, matrices, primitives, series),
+        *(target, tracing),
+    )
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]
     )

@@ -18,7 +18,8 @@ import numpy as np
 from lag_envs.stepping.driver import LARGEST_COUNT, SMALLEST_PART
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series, StepProgress, elementary
+from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series, StepProgress
+from lag_envs.stepping.target import elementary
 from lag_envs.stepping.tracing import IEEE, MAGIC, Operation, TracedNumber, Value
 
 #: Every operation of a recording, in Python, JavaScript and C++. Where Python raises an error, C does not.
@@ -228,7 +229,7 @@ class Statement(NamedTuple):
 
 
 class Script:
-    """The target that writes source text: numbers are names or literals; see `series.Target`.
+    """The target that writes source text: numbers are names or literals; see `target.Target`.
 
     Examples
     --------
@@ -326,7 +327,7 @@ class Script:
         known = self.emit(operations, inputs)
         return [known[r] if isinstance(r, str) else r for r in results]
 
-    # --- the operations of `series.Target` ------------------------------------------------------------------
+    # --- the operations of `target.Target` ------------------------------------------------------------------
 
     def number(self, value: float) -> Any:
         return float(value)
