@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
 from lag_envs.scenes.derivation import form_of, layout_of
-from lag_envs.tasks.base import Lifted, Task, TaskFormulas
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.formulas import Lifted, TaskFormulas
 
 Array = NDArray[np.float64]
 

@@ -19,6 +19,7 @@ from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes.checks import check_lags, check_number, shown
 from lag_envs.scenes.declaring import complete
 from lag_envs.scenes.derivation import layout_of
+from lag_envs.tasks.formulas import UNBOUNDED
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -45,7 +46,6 @@ MOST_DRAWN = 8
 _WHOLE = 1e-9
 #: Bounds that are not proved are wider by this share; values beyond them are clipped.
 MARGIN = 0.1
-_UNBOUNDED = float(np.finfo(np.float32).max)
 
 
 def normals(first: Any, second: Any, xp: Any) -> list[Any]:
@@ -461,9 +461,9 @@ def seen_box(task: Task) -> tuple[list[float], list[float]]:
         ends = [box[0][i] for box in boxes], [box[1][i] for box in boxes]
         for values, end, side, out in ((ends[0], min, -1.0, low), (ends[1], max, 1.0, high)):
             bound = end(values)
-            if abs(bound) < _UNBOUNDED:
+            if abs(bound) < UNBOUNDED:
                 if found.within or found.lag or min(values) != max(values):
                     bound += side * MARGIN * abs(bound)
                 bound += side * sigma * LARGEST_NORMAL
-            out.append(min(max(bound, -_UNBOUNDED), _UNBOUNDED))
+            out.append(min(max(bound, -UNBOUNDED), UNBOUNDED))
     return low, high
