@@ -305,16 +305,8 @@ class TaskFormulas:
 
     def _reward(self, name: str, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
         xp = self._known(xp, y, z)
-        value = self._call(
-            name,
-            k,
-            self.named_state(y),
-            self.named_state(z),
-            self._applied(u),
-            self.named_targets(g),
-            k.dt,
-            xp,
-        )
+        before, after = self.named_state(y), self.named_state(z)
+        value = self._call(name, k, before, after, self._applied(u), self.named_targets(g), k.dt, xp)
         if value is None or isinstance(value, Mapping | Sequence):
             raise FormulaError(
                 f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number"
@@ -424,6 +416,7 @@ class TaskFormulas:
 
 
 def control_of(acting: Acting, a: Any, xp: Any) -> Any:
+    """Return the control that an action in [-1, 1], or a choice, requests."""
     if acting.values:
         value: Any = acting.values[-1]
         for i in reversed(range(len(acting.values) - 1)):
