@@ -56,7 +56,7 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
     return found
 
 
-def reached(curve: Iterable[Sequence[float]], level: float, clock: int = 1) -> float | None:
+def first_reached(curve: Iterable[Sequence[float]], level: float, clock: int = 1) -> float | None:
     """Return when a curve first reached a level; None for never.
 
     The last number of each point is its score; `clock` selects the result: 0 steps, 1 seconds.
@@ -64,7 +64,7 @@ def reached(curve: Iterable[Sequence[float]], level: float, clock: int = 1) -> f
     return next((point[clock] for point in curve if point[-1] >= level), None)
 
 
-def times(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
+def times_to_levels(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
     """Return for each level how many seeds reached it, and the medians of steps and seconds.
 
     Examples
@@ -74,7 +74,7 @@ def times(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
     """
     found = {}
     for level in LEVELS:
-        steps, seconds = ([reached(curve, level, clock) for curve in curves] for clock in (0, 1))
+        steps, seconds = ([first_reached(curve, level, clock) for curve in curves] for clock in (0, 1))
         seeds = sum(value is not None for value in steps)
         found[str(level)] = {"seeds": seeds, "steps": median_time(steps), "seconds": median_time(seconds)}
     return found
@@ -119,10 +119,10 @@ def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
                 "curves": {"steps": learning_curve(curves, 0), "seconds": learning_curve(curves, 1)},
             }
             if scale is not None:
-                entry["reached"] = times(curves)
+                entry["reached"] = times_to_levels(curves)
         found[agent["name"]] = entry
     known = None if scale is None else [scale.random, scale.best]
-    return {"known": known, "agents": ranked(found), "improvement": compare(found)}
+    return {"known": known, "agents": best_first(found), "improvement": chances_of_improvement(found)}
 
 
 def level(conditions: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array]]:
@@ -141,15 +141,17 @@ def level(conditions: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array
     return found
 
 
-def ranked(agents: Mapping[str, Data]) -> dict[str, Data]:
+def best_first(agents: Mapping[str, Data]) -> dict[str, Data]:
     """Return the agents, the best first."""
     return dict(sorted(agents.items(), key=lambda item: (-item[1]["conditions"][NOMINAL]["value"], item[0])))
 
 
-def compare(agents: Mapping[str, Data]) -> Data:
+def chances_of_improvement(agents: Mapping[str, Data]) -> Data:
     """Return for each learner the probability that a run of it is better than a policy of another agent."""
     found: dict[str, Data] = {}
-    each = {name: np.array(agent["conditions"][NOMINAL]["each"]) for name, agent in ranked(agents).items()}
+    each = {
+        name: np.array(agent["conditions"][NOMINAL]["each"]) for name, agent in best_first(agents).items()
+    }
     for one in (name for name in each if agents[name]["kind"] == "learned"):
         for other in (name for name in each if name != one):
             x, y = each[one], each[other]

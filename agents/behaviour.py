@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from agents.learners import LEARNERS, label
-from agents.results import ROOT, to_json
+from agents.learners import LEARNERS, learner_label
+from agents.results import ROOT, results_json
 from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.submit import AUTHORS
 from lag_envs import TASKS
 from lag_envs.controllers import Constant, build
-from lag_envs.evaluation.rollout import Episodes, Rollout, record
-from lag_envs.evaluation.statistics import rounded
+from lag_envs.evaluation.rollout import Episodes, Rollout, record_rollout
+from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.submission import load
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 BOARD, OUTPUT = ROOT / "leaderboard", ROOT / "agents" / "results" / "behaviour.json"
 EPISODES = 1_000
@@ -67,21 +67,23 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
         agent = None if found.plans else build(task, name)  # planning takes long
         if agent is not None and not isinstance(agent, Constant):  # a constant action shows nothing
             yield name, [agent]
-    board, names = Board(BOARD), {label(algo): algo for algo in LEARNERS}
+    board, names = Board(BOARD), {learner_label(algo): algo for algo in LEARNERS}
     for entry in sorted(board.read().entries.values(), key=lambda entry: entry.id):
-        ours = entry.env == env_id and entry.kind == "learned" and list(entry.authors) == AUTHORS
-        if ours and entry.state == "verified":
+        own = entry.env == env_id and entry.kind == "learned" and list(entry.authors) == AUTHORS
+        if own and entry.state == "verified":
             yield (
                 names[entry.name],
                 [policy.agent() for _, policy in load(board.submission(entry.id)).policies],
             )
 
 
-def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
+def behaviour_of(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
     """Return the measures of an environment's agents: for each agent and measure, a number per policy."""
     found: dict[str, dict[str, list[float | None]]] = {}
     for name, policies in agents(env_id):
-        rows = [measures(record(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies]
+        rows = [
+            measures(record_rollout(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies
+        ]
         found[name] = {key: [row[key] for row in rows] for key in rows[0]}
     return found
 
@@ -104,13 +106,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.env and OUTPUT.exists():
         found = json.loads(OUTPUT.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
-        found[env_id] = rounded(measured(env_id))
+        found[env_id] = rounded_data(behaviour_of(env_id))
         for name, measures in found[env_id].items():
             lines = (f"{key}: {values}" for key, values in measures.items())
             print(env_id, name, *lines, sep="\n  ", flush=True)
         in_order = {name: found[name] for name in TASKS if name in found}
         about = {"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED}
-        write(OUTPUT, to_json(about | {"envs": in_order}))
+        write_file(OUTPUT, results_json(about | {"envs": in_order}))
     return 0
 
 

@@ -15,17 +15,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.results import to_json
+from agents.results import results_json
 from agents.run import UserError, reports_errors
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import batch
 from lag_envs.benchmark.results import quartiles, ratios
-from lag_envs.benchmark.rounds import Contestant, Run, measure
-from lag_envs.evaluation.statistics import rounded
+from lag_envs.benchmark.rounds import Contestant, Run, measure_rates
+from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import ONE_THREAD, machine
-from lag_envs.store import write
-from lag_envs.tables import columns
+from lag_envs.store import write_file
+from lag_envs.tables import aligned
 
 ENV = "PivotedBar-v0"
 SIZES = (1, 16, 64, 256)
@@ -52,20 +52,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.rounds < 1:
         raise UserError(f"--rounds must be at least 1, got {args.rounds}")
     os.environ.update(ONE_THREAD)
-    kinds = {"adapter": adapter, "DummyVecEnv": dummy}
-    steps = [Contestant(k, ENV, "step", n, partial(stepping, f, n)) for n in SIZES for k, f in kinds.items()]
+    kinds = {"adapter": make_adapter, "DummyVecEnv": dummy}
+    steps = [
+        Contestant(k, ENV, "step", n, partial(prepared_steps, f, n)) for n in SIZES for k, f in kinds.items()
+    ]
     learn = [Contestant(k, ENV, "PPO", TRAINED, partial(training, f)) for k, f in kinds.items()]
     # A sample of training is at least one roll-out with its updates, however short a sample is requested.
-    complete = measure(steps, args.rounds, 0.1) and measure(learn, args.rounds, 0.1)
-    rows = [summary(ours, theirs) for ours, theirs in zip(*[iter(steps + learn)] * 2, strict=True)]
-    print("\n".join(table(rows)))
+    complete = measure_rates(steps, args.rounds, 0.1) and measure_rates(learn, args.rounds, 0.1)
+    rows = [
+        rates_and_ratio(adapter, dummy) for adapter, dummy in zip(*[iter(steps + learn)] * 2, strict=True)
+    ]
+    print("\n".join(table_lines(rows)))
     if args.output:
         about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
-        write(args.output, to_json(about | {"env": ENV, "rows": rounded(rows)}))
+        write_file(args.output, results_json(about | {"env": ENV, "rows": rounded_data(rows)}))
     return 0 if complete and not any(row["problem"] for row in rows) else 1
 
 
-def adapter(n: int) -> Any:
+def make_adapter(n: int) -> Any:
     """Make our vector environment."""
     from lag_envs.sb3 import make_vec_env
 
@@ -82,7 +86,7 @@ def dummy(n: int) -> Any:
     return DummyVecEnv([lambda: gym.make(ENV)] * n)
 
 
-def stepping(make: Any, n: int) -> Run:
+def prepared_steps(make: Any, n: int) -> Run:
     """Prepare steps with actions made beforehand."""
     envs = make(n)
     envs.reset()
@@ -91,10 +95,10 @@ def stepping(make: Any, n: int) -> Run:
 
 def training(make: Any) -> Run:
     """Prepare PPO with the hyperparameters that `agents.train` uses."""
-    from agents.learners import hyperparameters, make_model
+    from agents.learners import make_model, zoo_hyperparameters
     from agents.run import Run as TrainingRun
 
-    hyper = hyperparameters("ppo", ENV)
+    hyper = zoo_hyperparameters("ppo", ENV)
     folder = Path(tempfile.gettempdir())
     model = make_model(TrainingRun(folder, ENV, "ppo", 0, 1, hyper), make(TRAINED))
     model.tensorboard_log = None
@@ -107,17 +111,17 @@ def training(make: Any) -> Run:
     return run
 
 
-def summary(ours: Contestant, theirs: Contestant) -> dict[str, Any]:
+def rates_and_ratio(adapter: Contestant, dummy: Contestant) -> dict[str, Any]:
     """Return both rates [steps/s] and their ratio: lower quartile, median and upper quartile."""
     row: dict[str, Any] = {
-        "kind": ours.kind, "num_envs": ours.num_envs, "problem": ours.problem or theirs.problem,
-        "adapter": ours.rates, "dummy": theirs.rates,
+        "kind": adapter.kind, "num_envs": adapter.num_envs, "problem": adapter.problem or dummy.problem,
+        "adapter": adapter.rates, "dummy": dummy.rates,
     }  # fmt: skip
-    pairs = ratios(ours.rates, theirs.rates)
+    pairs = ratios(adapter.rates, dummy.rates)
     return row | ({"ratio": quartiles(pairs)} if pairs else {})
 
 
-def table(rows: Sequence[dict[str, Any]]) -> list[str]:
+def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the lines of the table."""
     cells = [("", "environments", "adapter", "DummyVecEnv", "ratio")]
     for row in rows:
@@ -126,7 +130,7 @@ def table(rows: Sequence[dict[str, Any]]) -> list[str]:
             continue
         both = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
         cells.append((row["kind"], str(row["num_envs"]), *both, f"{row['ratio'][1]:.1f}"))
-    return columns(cells)
+    return aligned(cells)
 
 
 if __name__ == "__main__":

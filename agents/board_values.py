@@ -18,7 +18,7 @@ import numpy as np
 from agents.optimum import DEFAULT_FOLDER, Solution, solvable
 from agents.run import check_env, reports_errors
 from lag_envs import TASKS
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 POINTS = 61  #: along each axis
 
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     envs = [check_env(name) for name in args.env] or solved
     for env_id in envs:
         path = args.board / "values" / f"{env_id}.json"
-        write(path, json.dumps(coarse(env_id), separators=(",", ":")) + "\n")
+        write_file(path, json.dumps(coarse(env_id), separators=(",", ":")) + "\n")
         print(path, flush=True)
     return 0
 

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
-from agents.learners import OwnSettings, trainable
+from agents.learners import LearnerSettings, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import FIRST_FRESH_SEED, UserError
 from lag_envs.controllers import build
@@ -32,7 +32,7 @@ NAME = "cloning"  #: see `agents.learners.OWN`
 Array = NDArray[np.float32]
 
 
-class Settings(OwnSettings):
+class Settings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME

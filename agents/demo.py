@@ -18,13 +18,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.learners import LEARNERS, hyperparameters, label, load_policy
-from agents.run import RESULT, Run, UserError, check_name, fresh_seeds, own_env, reports_errors
-from agents.train import command, follow, here
+from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparameters
+from agents.run import RESULT, Run, UserError, fresh_seeds, known_name, own_env, reports_errors
+from agents.train import command, here, show_progress
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import known_returns, score
-from lag_envs.store import write
-from lag_envs.tables import columns
+from lag_envs.store import write_file
+from lag_envs.tables import aligned
 from lag_envs.tasks.registration import make_task
 
 DEFAULT_FOLDER = Path("runs/demo")
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{run.env}, {run.algo}, seed {run.seed}: {run.trained:,} of {run.steps:,} steps trained")
         if run.load_result() is None:
             print("Loading PyTorch and compiling the environment (kept for the next time) ...", flush=True)
-            failed, stopped = follow([run], here)
+            failed, stopped = show_progress([run], here)
             for reason in failed.values():
                 print(f"agents.demo: error: {reason}", file=sys.stderr)
             if stopped or failed:
@@ -94,14 +94,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def open_run(args: argparse.Namespace) -> Run:
     """Return the run that the arguments ask for, or raise a UserError."""
     env = own_env(args.env)
-    check_name("algorithm", args.algo, LEARNERS)
+    known_name("algorithm", args.algo, LEARNERS)
     if not 0 <= args.seed < 2**31:
         raise UserError(f"--seed must lie between 0 and 2147483647, got {args.seed}")
     if args.steps is not None and args.steps < 1:
         raise UserError(f"--steps must be at least 1, got {args.steps}")
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
-    hyper = hyperparameters(args.algo, env)
+    hyper = zoo_hyperparameters(args.algo, env)
     steps = args.steps or int(hyper["n_timesteps"])
     run = Run(args.output, env, args.algo, args.seed, steps, hyper, "" if env == args.env else args.env)
     if args.new:
@@ -119,7 +119,7 @@ def report(run: Run, video: bool) -> None:
 
     policy = load_policy(run.folder)
     result = json.loads(run.path(RESULT).read_text())
-    learner = label(run.algo)
+    learner = learner_label(run.algo)
     seeds = fresh_seeds(EPISODES)
     started = time.perf_counter()
     task = make_task(run.env)
@@ -129,7 +129,7 @@ def report(run: Run, video: bool) -> None:
     seconds = time.perf_counter() - started
     draw_curve(run, learner, result, returns)
     if video:
-        record(policy, run, seeds[0])
+        record_video(policy, run, seeds[0])
     comparison = {
         "env": run.env,
         "evaluation_seeds": list(seeds),
@@ -138,7 +138,7 @@ def report(run: Run, video: bool) -> None:
             for name, r in returns.items()
         },
     }
-    write(run.path("comparison.json"), json.dumps(comparison, indent=1) + "\n")
+    write_file(run.path("comparison.json"), json.dumps(comparison, indent=1) + "\n")
 
     print(f"\nReturns over {EPISODES} fresh episodes of {run.env}")
     rows = [("", "mean", "lowest", "highest", "score")]
@@ -146,7 +146,7 @@ def report(run: Run, video: bool) -> None:
         part = score(run.env, r.mean())
         tail = "" if part is None else f"{part:.3f}"
         rows.append((name, f"{r.mean():.2f}", f"{r.min():.2f}", f"{r.max():.2f}", tail))
-    print("\n".join(columns(rows)))
+    print("\n".join(aligned(rows)))
     if known := known_returns(run.env):
         ends = f"0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g})"
         print(f"The score is {ends}.")
@@ -183,7 +183,7 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     figure.savefig(run.folder / "learning_curve.png", dpi=120)
 
 
-def record(policy: Any, run: Run, seed: int) -> None:
+def record_video(policy: Any, run: Run, seed: int) -> None:
     """Record one episode as a video."""
     from gymnasium.wrappers import RecordVideo
 

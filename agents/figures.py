@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.analysis import Data
-from agents.report import brief, number
+from agents.report import brief, meaningful_digits
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 
 #: Okabe and Ito's colours, which the colour-blind can tell apart.
@@ -93,7 +93,7 @@ def scores_figure(envs: Mapping[str, Data]) -> Any:
                     ax.plot(ends, [row + shift] * 2, "-", color=colour, lw=1.2)
                     ax.plot(value, row + shift, MARKS[agent["kind"]], color=colour, mfc=face, ms=5)
                 else:
-                    text = f"◂ {number(found['value'])}{'' if name == NOMINAL else ' (often)'}"
+                    text = f"◂ {meaningful_digits(found['value'])}{'' if name == NOMINAL else ' (often)'}"
                     ax.text(lowest, row + shift, text, va="center", fontsize=7, color=colour)
         names = [brief(name, agent) for name, agent in env["agents"].items()]
         ax.set_yticks(range(len(names)), names, fontsize=8)

@@ -31,8 +31,8 @@ from agents.run import (
     RESULT,
     Run,
     UserError,
-    check_name,
     fresh_seeds,
+    known_name,
     read_result,
 )
 from lag_envs import __version__
@@ -41,7 +41,7 @@ from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.scores import known_returns, score
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.registration import make_task
 
@@ -72,18 +72,18 @@ SCALE = "lag_envs.sb3.ScaledReward"
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
 
 
-def label(algo: str) -> str:
+def learner_label(algo: str) -> str:
     """Return a learner's name in tables."""
     return {**ALGORITHMS, **OWN}[algo][1]
 
 
 def learner(algo: str) -> type:
     """Return a learner's class."""
-    module, name = ALGORITHMS[check_name("algorithm", algo, ALGORITHMS)]
+    module, name = ALGORITHMS[known_name("algorithm", algo, ALGORITHMS)]
     return getattr(import_module(module), name)
 
 
-def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[str, Any]:
+def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[str, Any]:
     """Return the RL Zoo's hyperparameters for an algorithm and environment.
 
     Parameters
@@ -98,7 +98,7 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
     UserError
         For an unknown algorithm, or a file without readable entry for the environment.
     """
-    check_name("algorithm", algo, LEARNERS)
+    known_name("algorithm", algo, LEARNERS)
     if file is None:
         return lag_envs.hyperparams.hyperparameters(algo, make_task(env_id))
     import yaml
@@ -116,12 +116,12 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
 
 
 def suits(algo: str, task: Task) -> bool:
-    """Tell whether a learner supports a task's kind of actions: discrete or continuous."""
+    """Return whether a learner supports a task's kind of actions: discrete or continuous."""
     choices = bool(task.formulas.choices)
     return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
 
 
-class OwnSettings(Strict):
+class LearnerSettings(Strict):
     """Settings of a learner of our own.
 
     Attributes
@@ -275,7 +275,7 @@ def thaw(run: Run, content: Mapping[str, Any]) -> Any:
 # --- training -----------------------------------------------------------------------------------------------
 
 
-def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
+def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
     """Train the rest of a run, and write its result.
 
     Parameters
@@ -323,7 +323,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
             run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-            mean = play(run.env, Policy(self.model, bins=numbered(run.hyperparameters)), seeds).mean()
+            mean = play(run.env, LearnedPolicy(self.model, bins=numbered(run.hyperparameters)), seeds).mean()
             run.trained = self.last = self.num_timesteps
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
             if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
@@ -341,7 +341,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
             run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
         )
         watch.keep()
-    finish(run, best)
+    finish_training(run, best)
 
 
 def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
@@ -374,20 +374,20 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
         if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
             test()
     learner.policy.save(run.path(MODEL))
-    evaluate(run, learner.policy, run.trained)
+    evaluate_checkpoints(run, learner.policy, run.trained)
 
 
-def finish(run: Run, best: Mapping[str, Any]) -> None:
+def finish_training(run: Run, best: Mapping[str, Any]) -> None:
     """Write the policy, and evaluate it."""
-    write(run.path(MODEL), best["model"])
+    write_file(run.path(MODEL), best["model"])
     normalise = pickle.loads(best["normalisation"])
     if normalise is not None and normalise.norm_obs:
-        write(run.path(NORMALISATION), best["normalisation"])
+        write_file(run.path(NORMALISATION), best["normalisation"])
     model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu")
-    evaluate(run, Policy(model, normalise, numbered(run.hyperparameters)), best["trained"])
+    evaluate_checkpoints(run, LearnedPolicy(model, normalise, numbered(run.hyperparameters)), best["trained"])
 
 
-def evaluate(run: Run, policy: Any, kept: int) -> None:
+def evaluate_checkpoints(run: Run, policy: Any, kept: int) -> None:
     """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
@@ -408,14 +408,14 @@ def evaluate(run: Run, policy: Any, kept: int) -> None:
         | {name: version(name) for name in PACKAGES},
         "machine": f"{place['processor']}, {place['cores']} cores",
     }
-    write(run.path(RESULT), json.dumps(result, indent=1) + "\n")
+    write_file(run.path(RESULT), json.dumps(result, indent=1) + "\n")
     run.path(CHECKPOINT).unlink(missing_ok=True)
 
 
 # --- policies -----------------------------------------------------------------------------------------------
 
 
-class Policy:
+class LearnedPolicy:
     """A learner's policy as it acts in the environments themselves: observations in, actions in [-1, 1] out.
 
     Parameters
@@ -451,7 +451,7 @@ class Policy:
 
 
 def numbered(hyper: dict[str, Any]) -> bool:
-    """Tell whether a wrapper numbers the actions."""
+    """Return whether a wrapper numbers the actions."""
     return any(DISCRETISE in wrapper for wrapper in hyper.get("env_wrapper", []))
 
 
@@ -473,4 +473,4 @@ def load_policy(folder: Path) -> Any:
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"the policy in {folder} cannot be read ({reason}); train it again") from error
-    return Policy(model, normalise, numbered(result["hyperparameters"]))
+    return LearnedPolicy(model, normalise, numbered(result["hyperparameters"]))

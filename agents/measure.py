@@ -30,8 +30,8 @@ from agents.run import (
 )
 from lag_envs import TASKS, __version__, controllers, store
 from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
-from lag_envs.evaluation.rollout import Meter, Rollout, Step, observation_std
-from lag_envs.evaluation.statistics import rounded
+from lag_envs.evaluation.rollout import Meter, Rollout, RolloutStep, observation_std
+from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard import export
 from lag_envs.leaderboard.export import exported, find
 
@@ -97,9 +97,9 @@ def no_optimum(env_id: str) -> str:
 
 
 def _optimal(env_id: str) -> Any:
-    from agents.optimum import Optimal
+    from agents.optimum import GreedyPolicy
 
-    return Optimal(env_id)
+    return GreedyPolicy(env_id)
 
 
 def _policy(env_id: str, folder: Path) -> Any:
@@ -114,7 +114,7 @@ def _policy(env_id: str, folder: Path) -> Any:
     return exported(source, env_id).agent
 
 
-def learned(env_id: str, folder: Path) -> Entrant:
+def learned_policy(env_id: str, folder: Path) -> Entrant:
     """Return the policy of a finished run, or raise a UserError."""
     result = read_result(folder / RESULT)
     own = env_id, folder.parent.name, folder.name.removeprefix("seed")
@@ -158,7 +158,7 @@ def digest(*files: Path | str) -> str:
 
 
 @dataclass(frozen=True)
-class Job:
+class MeasurementJob:
     """One policy under one condition."""
 
     entrant: Entrant
@@ -197,7 +197,7 @@ class Evaluation:
     absent, broken : list of str
         Agents that are missing, and agents with a problem.
     returns : dict of str to list of float
-        By the key of a `Job`.
+        By the key of a `MeasurementJob`.
     noise : ndarray, shape (n_observation,)
         Scale of the observation noise.
     """
@@ -229,7 +229,7 @@ class Evaluation:
         first: dict[str, Entrant] = {}
         for folder in sorted(folders, key=lambda p: (p.parent.name, len(p.name), p.name)):
             try:
-                entrant = learned(self.env, folder)
+                entrant = learned_policy(self.env, folder)
                 check_alike(entrant, first.setdefault(entrant.name, entrant))
             except UserError as error:
                 self.broken.append(str(error))
@@ -238,7 +238,9 @@ class Evaluation:
         if not first:
             self.absent.append("learners: no finished run")
 
-    def jobs(self, names: Sequence[str] | None, episodes: int, changed: int | None = None) -> list[Job]:
+    def jobs(
+        self, names: Sequence[str] | None, episodes: int, changed: int | None = None
+    ) -> list[MeasurementJob]:
         """Return the measurements to make for the named agents.
 
         Parameters
@@ -256,26 +258,26 @@ class Evaluation:
             return episodes if condition.name == NOMINAL else min(episodes, most)
 
         return [
-            Job(entrant, condition, count(entrant, condition))
+            MeasurementJob(entrant, condition, count(entrant, condition))
             for entrant in self.entrants
             if names is None or entrant.name in names
             for condition in conditions(self.env)
         ]
 
-    def run(self, job: Job, agent: Any, tick: Callable[[Step], Any]) -> NDArray[np.float64]:
+    def run(self, job: MeasurementJob, agent: Any, tick: Callable[[RolloutStep], Any]) -> NDArray[np.float64]:
         """Return an agent's returns under a condition, shape (episodes,); `tick` is called with each step."""
         found = job.condition
         sensor = Sensor(found.noise * self.noise, found.late)
         return Rollout(self.env, agent, fresh_seeds(job.episodes), sensor, **found.options).run(tick)
 
-    def keep(self, job: Job, returns: NDArray) -> None:
+    def keep(self, job: MeasurementJob, returns: NDArray) -> None:
         """Store a measurement."""
         about = {"key": job.key, "agent": str(job.entrant), "condition": job.condition.name}
-        row = about | {"returns": rounded(returns.tolist())}
+        row = about | {"returns": rounded_data(returns.tolist())}
         store.append(self.file, row)
         self.returns[job.key] = row["returns"]
 
-    def measured(self, jobs: Iterable[Job]) -> Iterator[Data]:
+    def measured(self, jobs: Iterable[MeasurementJob]) -> Iterator[Data]:
         """Yield the input of `summarise_env` for each agent, from the finished jobs."""
         order = [condition.name for condition in conditions(self.env)]
         for name, group in groupby(jobs, key=lambda job: job.entrant.name):
@@ -311,7 +313,7 @@ def _where(run: Data) -> str:
     return f"{run.get('machine', 'unknown machine')}: {found}"
 
 
-def measure(todo: Sequence[tuple[Evaluation, Job]]) -> None:
+def measure_policies(todo: Sequence[tuple[Evaluation, MeasurementJob]]) -> None:
     """Measure, policy by policy, and show the progress."""
     from tqdm import tqdm
 

@@ -22,20 +22,21 @@ from numpy.typing import ArrayLike, NDArray
 from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds
 from agents.value_iteration import (
     CacheError,
+    DynamicProgramme,
     Grid,
     Kick,
-    carried,
     interpolate_rows,
+    regridded,
     stretched,
 )
-from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
 from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.envs.model import Model
 from lag_envs.evaluation import statistics
-from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.host import machine
-from lag_envs.store import write
+from lag_envs.mechanics.recording import parameter_values
+from lag_envs.store import write_file
 from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import FILE
@@ -73,7 +74,7 @@ A task with plans (`Task.plans`) is planned instead, by iLQR from random guesses
                 a plan that is followed from any start by feedback; of those found, the one with the best
                 mean return over 200 fresh starts
   src/lag_envs/controllers/plans/ID-quick.npz
-                a quicker one, from which each episode is planned anew
+                a quicker one, from which each episode is replanned
   src/lag_envs/tasks/measured.json
                 what both get, by python -m agents.scale: means over fresh starts with standard errors; the
                 best of them is the best known, a lower bound
@@ -171,7 +172,7 @@ class Solution:
             self.programs.append(program)
             self.seconds += program.seconds
 
-    def program(self, target: float | None) -> Programme:
+    def program(self, target: float | None) -> DynamicProgramme:
         """Return the dynamic programme for a target."""
         problem = self.problem
         # The fingerprint does not cover the step between the points where it is evaluated.
@@ -182,7 +183,7 @@ class Solution:
         actions = np.linspace(-1.0, 1.0, problem.actions)
         step = functools.partial(self.step, target=target)
         places = grid(problem, self.level, target)
-        return Programme(places, actions, step, self.steps, self.kick, parameters)
+        return DynamicProgramme(places, actions, step, self.steps, self.kick, parameters)
 
     def states(self, points: Array) -> Array:
         """Return the scene's states for points on the grid."""
@@ -234,7 +235,7 @@ class Solution:
                     # Points are mapped to the same place among the nodes of target k as among their own
                     # target's, so that targets and the edges at which episodes end correspond.
                     there, axis = points[rows], self._moving
-                    there[:, axis] = carried(
+                    there[:, axis] = regridded(
                         there[:, axis], self._own, own[rows], self.programs[k].grid.axes[axis]
                     )
                     result[rows] += weight[rows] * self._at(k, times[rows], there)
@@ -267,7 +268,7 @@ class Solution:
         return sum(w * self.value(times, p, targets) for w, p in zip(weights, outcomes, strict=True))
 
 
-class Optimal(LookAhead):
+class GreedyPolicy(LookAhead):
     """The greedy policy of a computed value function.
 
     Parameters
@@ -361,10 +362,10 @@ def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
     return float(values[-1] + steps[-1] / (2.0**order - 1.0)), float(abs(steps[-1])), order
 
 
-def parameters(task: Task) -> dict[str, float]:
+def scene_numbers(task: Task) -> dict[str, float]:
     """Return the numbers of a task's scene, its step [s] and the steps of an episode."""
     scene = task.scene
-    return {name: getattr(scene, name) for name in scene._numbers()} | {"dt": task.dt, "limit": task.limit}
+    return parameter_values(scene) | {"dt": task.dt, "limit": task.limit}
 
 
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
@@ -392,7 +393,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
     relaxed = env_id != source or bool(problem.options)
     lower, started = None, time.process_time()
     if not relaxed:
-        agent = Optimal(env_id, solution=solution)
+        agent = GreedyPolicy(env_id, solution=solution)
         found = statistics.estimate([play(env_id, agent, fresh_seeds(EPISODES))])
         low, high = (round(found[end], 4) for end in ("low", "high"))
         lower = {"mean": round(found["mean"], 4), "interval": [low, high]}
@@ -406,7 +407,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         "solved": source + (" with " + ", ".join(f"{k}={v:g}" for k, v in problem.options.items())
                             if problem.options else ""),
         "how": explanation(env_id, source, problem, grids),
-        "parameters": parameters(TASKS[source](**problem.options)),
+        "parameters": scene_numbers(TASKS[source](**problem.options)),
         "axes": [
             {"label": a.label, "low": a.low, "high": a.high, "cells_at_level_1": a.cells,
              "even_within": a.scale, "centre": a.centre, "periodic": a.periodic}
@@ -467,7 +468,7 @@ def explanation(env_id: str, source: str, problem: ValueIteration, grids: Sequen
 # --- figures ------------------------------------------------------------------------------------------------
 
 
-def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
+def draw_values(env_id: str, folder: Path, file: Path, level: float) -> None:
     """Draw the value function at the start, and where the best action changes sign."""
     import matplotlib
     from matplotlib.figure import Figure
@@ -498,7 +499,7 @@ def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
                 plot.set_title(f"{name} = {axes[2][i]:.3g} {unit.strip('[]')}", fontsize=9)
         plots[0].set_ylabel(problem.axes[1].label)
         if not problem.options and len(axes) == 2:
-            played = record(Rollout(env_id, Optimal(env_id, solution=solution), fresh_seeds(1)))
+            played = record_rollout(Rollout(env_id, GreedyPolicy(env_id, solution=solution), fresh_seeds(1)))
             states = played.states[:, 0, solution.keep]
             if problem.axes[0].periodic:
                 states[:, 0] = np.mod(states[:, 0], problem.axes[0].high)
@@ -554,7 +555,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         last = {env_id for env_id in able if known[env_id] and known[env_id].relaxed}
         ids = [check_env(name) for name in args.env] or sorted(able, key=last.__contains__)
         for env_id in dict.fromkeys(ids):
-            work(env_id, args)
+            compute_optimum(env_id, args)
     except (UserError, CacheError, OSError) as error:
         print(f"agents.optimum: error: {error}", file=sys.stderr)
         return 2
@@ -570,12 +571,12 @@ def _interrupt(number: int, frame: Any) -> None:
     raise KeyboardInterrupt(number)
 
 
-def work(env_id: str, args: argparse.Namespace) -> None:
+def compute_optimum(env_id: str, args: argparse.Namespace) -> None:
     """Compute, write and draw one environment's optimum; if it has no grid, plan instead."""
     if TASKS[env_id].plans is not None:
         from agents import plans, scale  # they play what is found here
 
-        plans.find(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)
+        plans.find_plans(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)
         if not args.quick:
             scale.main(
                 [
@@ -593,10 +594,12 @@ def work(env_id: str, args: argparse.Namespace) -> None:
         return
     results, images = (args.folder, args.folder) if args.quick else (RESULTS, IMAGES)
     result = compute(env_id, args.folder, quick=args.quick, new=args.new)
-    write(results / f"{env_id}.json", json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+    write_file(results / f"{env_id}.json", json.dumps(result, indent=2, ensure_ascii=False) + "\n")
     if env_id in solvable():
         levels = solvable()[env_id].levels
-        draw(env_id, args.folder, images / f"value-{env_id}.png", levels[0] if args.quick else levels[1])
+        draw_values(
+            env_id, args.folder, images / f"value-{env_id}.png", levels[0] if args.quick else levels[1]
+        )
     lower = result["lower"]
     low = "see the agents' results" if lower is None else f"{lower['mean']:.3f} {lower['interval']}"
     found = result["estimate"]

@@ -33,12 +33,12 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
-from agents.learners import OwnSettings, trainable
+from agents.learners import LearnerSettings, trainable
 from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
-from agents.train import command, follow, here, plan, summarise
+from agents.train import command, here, planned_runs, print_returns, show_progress
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 NAME = "fast_ppo"  #: see `agents.learners.OWN`
 Array = NDArray[np.float32]
@@ -47,7 +47,7 @@ Array = NDArray[np.float32]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-class Settings(OwnSettings):
+class Settings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -156,7 +156,7 @@ class Policy:
         arrays = {name: array for layer in layers for name, array in layer.items()}
         arrays |= {"choices": np.array(self.choices, np.int64), "largest": np.array(self.largest)}
         np.savez(file, allow_pickle=False, **arrays)
-        write(path, file.getvalue())
+        write_file(path, file.getvalue())
 
     @classmethod
     def load(cls, path: Path) -> Policy:
@@ -167,7 +167,7 @@ class Policy:
             return cls(layers, tuple(found["choices"].tolist()), float(found["largest"]))
 
 
-class Continuous:
+class GaussianActor:
     """Continuous actions: Gaussian around the actor's outputs, with noise held for some steps.
 
     The noise is features · E, where E (features, actions) is drawn with a learned standard deviation of each
@@ -198,7 +198,7 @@ class Continuous:
         return -0.5 * ((actions - means).square() / variance + log).sum(1), 0.5 * log.sum(1)
 
 
-class Choices:
+class CategoricalActor:
     """Discrete actions: the actor outputs a logit for each value of each list."""
 
     def __init__(self, policy: Policy) -> None:
@@ -220,7 +220,7 @@ class Choices:
 # --- learning -----------------------------------------------------------------------------------------------
 
 
-class Rollout(NamedTuple):
+class Experience(NamedTuple):
     """The experience of n environments in T steps."""
 
     observations: Array  #: (T + 1, n, n_observation)
@@ -266,7 +266,9 @@ class Learner:
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
         self.policy = Policy([], formulas.choices, formulas.largest)
-        self.head = Choices(self.policy) if formulas.choices else Continuous(settings, formulas.actions)
+        self.head = (
+            CategoricalActor(self.policy) if formulas.choices else GaussianActor(settings, formulas.actions)
+        )
         # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
         parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
         self.parameters = nn.Parameter(torch.cat([p.detach().flatten() for p in parts]))
@@ -284,12 +286,12 @@ class Learner:
         self.update(rollout, *self.advantages(rollout))
         self.trained += rollout.rewards.size
 
-    def collect(self) -> Rollout:
+    def collect(self) -> Experience:
         """Let the policy act."""
         steps, n = self.settings.n_steps, self.settings.n_envs
         wide = self.observation.shape[1]
         kind = np.int64 if self.policy.choices else np.float32
-        found = Rollout(
+        found = Experience(
             np.empty((steps + 1, n, wide), np.float32), np.empty((steps, n, self.actions), kind),
             np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_), np.empty((steps, n), np.bool_),
             np.zeros((steps, n, wide), np.float32),
@@ -308,7 +310,7 @@ class Learner:
         return found
 
     @torch.no_grad()
-    def advantages(self, found: Rollout) -> tuple[Array, Array]:
+    def advantages(self, found: Experience) -> tuple[Array, Array]:
         """Return the advantages of the actions and the critic's targets, (T, n) each.
 
         A truncated episode would have continued: the value of its last observation stands for the rest.
@@ -325,7 +327,7 @@ class Learner:
             later = advantages[t] = surprise[t] + decay * ~found.over[t] * later
         return advantages, advantages + values[:-1]
 
-    def update(self, found: Rollout, advantages: Array, targets: Array) -> None:
+    def update(self, found: Experience, advantages: Array, targets: Array) -> None:
         """Improve actor and critic by some epochs of Adam on the collected experience."""
         s, body, last = self.settings, self.actor[:-1], self.actor[-1]
         self.adam.param_groups[0]["lr"] = s.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
@@ -407,7 +409,7 @@ def parser() -> argparse.ArgumentParser:
     group = p.add_argument_group("settings, of which each task has its own")
     for name in OPTIONS:
         field = Settings.model_fields[name]
-        kind: Any = {float: float, bool: truth}.get(field.annotation, int)
+        kind: Any = {float: float, bool: yes_or_no}.get(field.annotation, int)
         many: Any = {"nargs": "+"} if field.annotation == list[PositiveInt] else {}
         group.add_argument(
             "--" + name.replace("_", "-"), type=kind, metavar="X", help=field.description, **many
@@ -415,7 +417,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def truth(text: str) -> bool:
+def yes_or_no(text: str) -> bool:
     """Return the value of yes or no."""
     if text not in ("yes", "no"):
         raise argparse.ArgumentTypeError(f"must be yes or no, got {text!r}")
@@ -428,12 +430,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     given = {name: getattr(args, name) for name in OPTIONS}
     changed = {name: value for name, value in given.items() if value is not None}
-    runs = plan(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
+    runs = planned_runs(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
         Settings.of(run.hyperparameters)  # fail now, not after another seed has been trained
     todo = [run for run in runs if run.load_result() is None]
-    failed, stopped = follow(todo, here) if todo else ({}, False)
-    summarise([run for run in runs if run.name not in failed])
+    failed, stopped = show_progress(todo, here) if todo else ({}, False)
+    print_returns([run for run in runs if run.name not in failed])
     for name, reason in failed.items():
         print(f"{name} failed: {reason}", file=sys.stderr)
     if stopped or failed:

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from agents import learners
-from agents.analysis import LEVELS, reached
-from agents.learners import LEARNERS, hyperparameters, label
-from agents.run import Run, UserError, check_env, check_name, reports_errors, terminable
+from agents.analysis import LEVELS, first_reached
+from agents.learners import LEARNERS, learner_label, zoo_hyperparameters
+from agents.run import Run, UserError, check_env, known_name, reports_errors, terminable
 from lag_envs import store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
 from lag_envs.scores import known_returns, score
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 ENV = "PivotedBar-v0"
 #: Tests of a training, and episodes of each.
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check_env(args.env)
     if known_returns(args.env) is None:
         raise UserError(f"{args.env} has no scale of scores yet; python -m agents.scale measures one")
-    names = [check_name("learner", name, LEARNERS) for name in dict.fromkeys(args.learners)]
+    names = [known_name("learner", name, LEARNERS) for name in dict.fromkeys(args.learners)]
     for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1)):
         if (value := getattr(args, name)) is not None and value < least:
             raise UserError(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with terminable():
             for seed in range(args.first_seed, args.first_seed + args.seeds):
                 for name in names:
-                    hyper = hyperparameters(name, args.env)
+                    hyper = zoo_hyperparameters(name, args.env)
                     settings = {
                         "env": args.env, "algo": name, "seed": seed,
                         "steps": args.steps or int(hyper["n_timesteps"]), "hyperparameters": hyper,
@@ -96,12 +96,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         if args.output:
                             store.append(args.output, row)
                     rows.append(row)
-                    print(f"{label(name)}, seed {seed}: {told(row)}", flush=True)
+                    print(f"{learner_label(name)}, seed {seed}: {told(row)}", flush=True)
     except KeyboardInterrupt:
         return 130
-    print("\n" + "\n".join(columns(table(rows))))
+    print("\n" + "\n".join(aligned(score_cells(rows))))
     if args.picture:
-        draw(rows, args.picture)
+        draw_scores(rows, args.picture)
     return 0
 
 
@@ -109,11 +109,11 @@ def raced(settings: dict[str, Any]) -> dict[str, Any]:
     """Train in a new process; return the curve and both clocks."""
     started = time.perf_counter()
     with workers.processes(1) as submit:
-        found = submit(train, settings).result()
+        found = submit(train_seed, settings).result()
     return found | {"process_seconds": round(time.perf_counter() - started - found.pop("tests_seconds"), 3)}
 
 
-def train(settings: dict[str, Any]) -> dict[str, Any]:
+def train_seed(settings: dict[str, Any]) -> dict[str, Any]:
     """Train one seed, and note each test: (steps, seconds, seconds on the processor, score)."""
     learners.TESTS, learners.TEST_EPISODES = TESTS, EPISODES
     curve: list[tuple[int, float, float, float]] = []
@@ -128,7 +128,7 @@ def train(settings: dict[str, Any]) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(Path(folder), **settings)
-        learners.train(run, show=lambda run: None, tested=tested)
+        learners.train_rest(run, show=lambda run: None, tested=tested)
         result = run.load_result() or {}
     return {
         "score": result["score"], "seconds": run.seconds, "processor_seconds": run.processor_seconds,
@@ -139,26 +139,28 @@ def train(settings: dict[str, Any]) -> dict[str, Any]:
 def told(row: dict[str, Any]) -> str:
     """Return a one-line summary of a training."""
     when = ", ".join(
-        f"{level:g} never" if (time := reached(row["curve"], level)) is None else f"{level:g} in {time:.1f} s"
+        f"{level:g} never"
+        if (time := first_reached(row["curve"], level)) is None
+        else f"{level:g} in {time:.1f} s"
         for level in LEVELS
     )
     return f"{when}; {row['score']:.3f} after {row['seconds']:.1f} s, process {row['process_seconds']:.1f} s"
 
 
-def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+def score_cells(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return the cells of the table: for each learner and level, how many seeds reached it, and when."""
     names = list(dict.fromkeys(row["algo"] for row in rows))
-    last = f"of {label(names[-1])}'s"
+    last = f"of {learner_label(names[-1])}'s"
     cells: list[tuple[str, ...]] = [("", "level", "reached", "steps", "s", "s on the processor", last)]
     for level in LEVELS:
         slowest = _median([row for row in rows if row["algo"] == names[-1]], level, 2)
         for name in names:
             own = [row for row in rows if row["algo"] == name]
-            count = sum(reached(row["curve"], level) is not None for row in own)
+            count = sum(first_reached(row["curve"], level) is not None for row in own)
             steps, seconds, processor = (_median(own, level, clock) for clock in range(3))
             part = "" if processor is None or not slowest else f"{processor / slowest:.2f}"
             cells.append(
-                (label(name), f"{level:g}", f"{count} of {len(own)}", _text(steps, ",.0f"),
+                (learner_label(name), f"{level:g}", f"{count} of {len(own)}", _text(steps, ",.0f"),
                  _text(seconds, ".2f"), _text(processor, ".2f"), part)
             )  # fmt: skip
     for name in names:
@@ -167,20 +169,28 @@ def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
         whole = float(np.median([row["process_seconds"] for row in own]))
         spread = f"{ends.min():.3f} to {ends.max():.3f}"
         cells.append(
-            (label(name), "end", f"{np.median(ends):.4f}", spread, "whole process", f"{whole:.1f}", "")
+            (
+                learner_label(name),
+                "end",
+                f"{np.median(ends):.4f}",
+                spread,
+                "whole process",
+                f"{whole:.1f}",
+                "",
+            )
         )
     return cells
 
 
 def _median(rows: Sequence[dict[str, Any]], level: float, clock: int) -> float | None:
-    return median_time([reached(row["curve"], level, clock) for row in rows])
+    return median_time([first_reached(row["curve"], level, clock) for row in rows])
 
 
 def _text(value: float | None, form: str) -> str:
     return "never" if value is None else format(value, form)
 
 
-def draw(rows: Sequence[dict[str, Any]], file: Path) -> None:
+def draw_scores(rows: Sequence[dict[str, Any]], file: Path) -> None:
     """Draw scores against seconds of training."""
     from matplotlib.figure import Figure
 
@@ -191,7 +201,9 @@ def draw(rows: Sequence[dict[str, Any]], file: Path) -> None:
         _, seconds, _, scores = zip(*row["curve"], strict=True)
         first = row["seed"] == rows[0]["seed"]
         colour = f"C{names.index(row['algo'])}"
-        axes.plot(seconds, scores, color=colour, alpha=0.7, label=label(row["algo"]) if first else None)
+        axes.plot(
+            seconds, scores, color=colour, alpha=0.7, label=learner_label(row["algo"]) if first else None
+        )
     axes.set(xlabel="seconds of training, on one core", ylabel="score", ylim=(-0.05, 1.05))
     axes.set_title(rows[0]["env"])
     axes.grid(alpha=0.3)

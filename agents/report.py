@@ -15,7 +15,7 @@ from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 
 IMAGES = "images"
 ADAPTER = Path(__file__).with_name("results") / "adapter.json"
@@ -26,7 +26,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 # --- the page -----------------------------------------------------------------------------------------------
 
 
-def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
+def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     """Return docs/agents.md.
 
     Parameters
@@ -67,13 +67,13 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         if any(env["improvement"] for env in envs.values()):
             parts.append(_image("agents-improvement.png", "Probability of improvement"))
             parts.append(_improvement_table(envs))
-    parts += ["## The adapter", adapter()] if ADAPTER.exists() else []
+    parts += ["## The adapter", adapter_rates()] if ADAPTER.exists() else []
     parts += ["## How it was measured", _method(data), "### Noise", _noise_table(envs)]
     parts += ["### Machine and versions", _about(data)]
     return "\n\n".join(parts) + "\n"
 
 
-def summary(data: Data) -> str:
+def summary_table(data: Data) -> str:
     """Return the table of docs/training.md: scores' range and the best agent of each kind, by environment."""
     rows = []
     for env_id, env in data["envs"].items():
@@ -114,7 +114,7 @@ def _range(env_id: str, env: Data) -> str:
         return "No range is set for scores; the numbers are mean returns."
     random, best = env["known"]
     text = f"Score 0 is a mean return of {random:g}, score 1 one of {best:g}."
-    found, known = measured(env_id).get("measured"), known_returns(env_id)
+    found, known = measured_entry(env_id).get("measured"), known_returns(env_id)
     if not found or not known or known.policy not in found:
         return text
     policy = known.policy
@@ -144,7 +144,7 @@ def _env_table(env: Data, episodes: int) -> str:
                 plus_minus(nominal["return"], nominal["return_error"]),
                 with_interval(nominal),
                 "" if often is None else with_interval(often),
-                "" if worst is None else f"{number(others[worst])}: {worst}",
+                "" if worst is None else f"{meaningful_digits(others[worst])}: {worst}",
                 f"{agent['seconds']:,.0f} s" if agent["kind"] == "learned" else "",
             ]
         )
@@ -394,7 +394,7 @@ def _optimum(env_id: str) -> list[str]:
     return [text, *([_image(picture.name, f"{env_id}: value function")] if picture.exists() else [])]
 
 
-def adapter() -> str:
+def adapter_rates() -> str:
     """Return the measurements of our `VecEnv` by `python -m agents.bench`."""
     found = json.loads(ADAPTER.read_text(encoding="utf-8"))
     rows = []
@@ -418,7 +418,7 @@ def _image(file: str, text: str) -> str:
     return f"![{text}]({IMAGES}/{file})"
 
 
-def number(value: float) -> str:
+def meaningful_digits(value: float) -> str:
     """Return a result with its meaningful digits.
 
     Examples
@@ -434,8 +434,9 @@ def number(value: float) -> str:
 def with_interval(found: Mapping[str, float]) -> str:
     """Return a value with its interval, if it has one."""
     if found["low"] is None or math.isnan(found["low"]):
-        return number(found["value"])
-    return f"{number(found['value'])} ({number(found['low'])}, {number(found['high'])})"
+        return meaningful_digits(found["value"])
+    value, low, high = (meaningful_digits(found[name]) for name in ("value", "low", "high"))
+    return f"{value} ({low}, {high})"
 
 
 def plus_minus(mean: float, error: float) -> str:

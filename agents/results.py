@@ -14,14 +14,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
-from agents.measure import Evaluation, Job, measure
+from agents.analysis import Data, best_first, chances_of_improvement, summarise_env, summarise_learners
+from agents.measure import Evaluation, MeasurementJob, measure_policies
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
 from lag_envs import TASKS, __version__
-from lag_envs.evaluation.statistics import rounded
-from lag_envs.host import installed, machine
+from lag_envs.evaluation.statistics import rounded_data
+from lag_envs.host import installed_versions, machine
 from lag_envs.scores import known_returns
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
@@ -90,8 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with terminable():
             found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
             # Only now: another command may have written it meanwhile.
-            data = summarise(found, usual, {} if args.new else load_summary(output))
-            write(output / SUMMARY, to_json(data))
+            data = summarise_results(found, usual, {} if args.new else load_summary(output))
+            write_file(output / SUMMARY, results_json(data))
             show(data, output)
         broken = [problem for evaluation, _ in found for problem in evaluation.broken]
         for problem in broken:
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int, changed: int | None
-) -> list[tuple[Evaluation, list[Job]]]:
+) -> list[tuple[Evaluation, list[MeasurementJob]]]:
     """Make the missing measurements; return the environments with everything to measure."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
@@ -124,14 +124,16 @@ def measure_all(
     jobs = [(evaluation, job) for evaluation, own in found for job in own]
     todo = [(evaluation, job) for evaluation, job in jobs if job.key not in evaluation.returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)
-    measure(todo)
+    measure_policies(todo)
     return found
 
 
 # --- the summary --------------------------------------------------------------------------------------------
 
 
-def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old: Data) -> Data:
+def summarise_results(
+    found: Sequence[tuple[Evaluation, list[MeasurementJob]]], episodes: int, old: Data
+) -> Data:
     """Return everything that page and figures need; agents not measured now keep their old numbers."""
     envs = dict(old.get("envs", {}))
     for evaluation, jobs in found:
@@ -146,30 +148,30 @@ def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old:
         "first_seed": FIRST_FRESH_SEED,
         "episodes": episodes,
         "machine": machine(),
-        "versions": {"lag_envs": __version__} | installed(PACKAGES),
+        "versions": {"lag_envs": __version__} | installed_versions(PACKAGES),
         "envs": envs,
-        "learners": rounded(summarise_learners(envs)),
+        "learners": rounded_data(summarise_learners(envs)),
     }
 
 
-def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[Job], before: Data | None) -> Data:
+def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[MeasurementJob], before: Data | None) -> Data:
     """Return the summary of an environment, with other agents' numbers from an earlier one."""
     env_id = evaluation.env
-    found = rounded(summarise_env(evaluation.measured(jobs), known_returns(env_id)))
+    found = rounded_data(summarise_env(evaluation.measured(jobs), known_returns(env_id)))
     if before is not None and before["known"] == found["known"]:
-        found["agents"] = ranked(before["agents"] | found["agents"])
-        found["improvement"] = rounded(compare(found["agents"]))
+        found["agents"] = best_first(before["agents"] | found["agents"])
+        found["improvement"] = rounded_data(chances_of_improvement(found["agents"]))
     elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
         print(f"{env_id}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr)
     kinds = {agent["kind"] for agent in found["agents"].values()}
     there = {*found["agents"], *(["learners"] if "learned" in kinds else [])}
     names = TASKS[env_id]().observation
-    found["observation_std"] = rounded(dict(zip(names, evaluation.noise.tolist(), strict=True)))
+    found["observation_std"] = rounded_data(dict(zip(names, evaluation.noise.tolist(), strict=True)))
     found["problems"] = [text for text in evaluation.absent if text.split(":")[0] not in there]
     return found
 
 
-def to_json(data: Data) -> str:
+def results_json(data: Data) -> str:
     """Return data as JSON, with lists of numbers on a line."""
     text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
@@ -194,16 +196,16 @@ def load_summary(output: Path, needed: bool = False) -> Data:
 def show(data: Data, output: Path) -> int:
     """Write figures, page, and the table of the best agents."""
     from agents.figures import figures
-    from agents.report import page, summary
+    from agents.report import agents_page, summary_table
     from lag_envs.generated import replaced
 
     files = figures(data, output / PICTURES)
     for old in set((output / PICTURES).glob("agents-*.png")) - set(files):
         old.unlink()
-    write(output / PAGE, page(data))
+    write_file(output / PAGE, agents_page(data))
     training = output / TRAINING
     if training.exists():
-        write(training, replaced(training.read_text(encoding="utf-8"), "agents", summary(data)))
+        write_file(training, replaced(training.read_text(encoding="utf-8"), "agents", summary_table(data)))
     print(f"Written: {output / PAGE} and {len(files)} figures")
     return 0
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 SCHEMA = 1
 #: Seeds of the episodes on which agents are compared, and of those on which a policy is tested during
@@ -99,7 +99,7 @@ class Run:
         names = ("trained", "seconds", "processor_seconds", "curve")
         progress = {name: getattr(self, name) for name in names}
         data = pickle.dumps({"settings": self.settings, "progress": progress, **content})
-        write(self.path(CHECKPOINT), data)
+        write_file(self.path(CHECKPOINT), data)
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint and adopt its progress, or return None if there is none.
@@ -146,7 +146,7 @@ class Run:
                 )
 
     def foreign(self) -> bool:
-        """Tell whether the folder holds files that are not the run's."""
+        """Return whether the folder holds files that are not the run's."""
         found = self.folder.iterdir() if self.folder.exists() else ()
         return any(f.name != "tensorboard" and not f.name.endswith(".part") for f in found)
 
@@ -181,7 +181,7 @@ def read_result(file: Path) -> dict[str, Any]:
 
 def check_env(env_id: str) -> str:
     """Return the id of an environment of the package, or raise a UserError that suggests similar ids."""
-    return check_name("environment", env_id, TASKS)
+    return known_name("environment", env_id, TASKS)
 
 
 def own_env(name: str) -> str:
@@ -211,7 +211,7 @@ def own_env(name: str) -> str:
         raise UserError(f"there is no environment {name!r}: {error}") from error
 
 
-def check_name(kind: str, name: str, known: Iterable[str]) -> str:
+def known_name(kind: str, name: str, known: Iterable[str]) -> str:
     """Return a known name, or raise a UserError with similar ones."""
     known = list(known)
     if name in known:

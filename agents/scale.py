@@ -22,19 +22,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learners import label
-from agents.measure import Entrant, learned
-from agents.optimum import Optimal, played
-from agents.results import ROOT, to_json
+from agents.learners import learner_label
+from agents.measure import Entrant, learned_policy
+from agents.optimum import GreedyPolicy, played
+from agents.results import ROOT, results_json
 from agents.run import RESULT, UserError, check_env, read_result, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tasks import resolve
-from lag_envs.tasks.measured import measured as of_package
+from lag_envs.tasks.measured import measured_entry as of_package
 
 Array = NDArray[np.float64]
 
@@ -89,17 +89,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
         before = kept.get(env_id, of_package(env_id))
-        kept[env_id] = measured(env_id, args.batches, args.quick, before, args.size, args.planned, args.runs)
+        kept[env_id] = measure_environment(
+            env_id, args.batches, args.quick, before, args.size, args.planned, args.runs
+        )
         if args.output:
             about = {"command": "python -m agents.scale", "date": datetime.date.today().isoformat()}
             about["machine"] = machine()
             seeds = {"first_seed": FIRST_SEED, "first_seed_of_references": REFERENCE_SEED}
             in_order = {name: kept[name] for name in TASKS if name in kept}
-            write(args.output, to_json(about | seeds | {"envs": in_order}))
+            write_file(args.output, results_json(about | seeds | {"envs": in_order}))
     return 0
 
 
-def measured(
+def measure_environment(
     env_id: str,
     batches: int,
     quick: bool,
@@ -158,17 +160,17 @@ def measured(
             found[name] = kept["measured"][name]
         elif name not in slow:
             agent = learners[name].make() if name in learners else make_controller(env_id, name)
-            returns = many(env_id, agent, batches, size)
+            returns = fast_returns(env_id, agent, batches, size)
             show(name, *mean_and_error(returns), len(returns), in_use.get(name))
         elif not quick:
-            agent = Optimal(env_id) if name == "optimal" else build(task, name)
+            agent = GreedyPolicy(env_id) if name == "optimal" else build(task, name)
             returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
             same = None
             if task.reference:
-                same = many(env_id, make_controller(env_id, task.reference), batches, size)
+                same = fast_returns(env_id, make_controller(env_id, task.reference), batches, size)
             show(name, *without_luck(returns, same), len(returns), in_use.get(name))
     if task.reference:
-        returns = many(env_id, make_controller(env_id, task.reference), batches, size, REFERENCE_SEED)
+        returns = fast_returns(env_id, make_controller(env_id, task.reference), batches, size, REFERENCE_SEED)
         show("reference", *mean_and_error(returns), len(returns), used)
         kept.setdefault("reference", found["reference"])
     if task.optimum:
@@ -176,7 +178,7 @@ def measured(
         show("optimum", *mean_and_error(best), len(best), (scale or {}).get("optimum"))
     if task.open:
         agent = make_controller(env_id, task.open.controller, **task.open.options)
-        returns = many(env_id, agent, batches, size, **task.open.options)
+        returns = fast_returns(env_id, agent, batches, size, **task.open.options)
         show("privileged", *mean_and_error(returns), len(returns))
     if not scale:
         first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
@@ -191,14 +193,16 @@ def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
     found: dict[str, Entrant] = {}
     best: dict[str, float] = {}
     for file in sorted(runs.glob(f"{env_id}/*/seed*/{RESULT}")):
-        entrant, mean = learned(env_id, file.parent), read_result(file)["mean_return"]
-        name = label(entrant.name)
+        entrant, mean = learned_policy(env_id, file.parent), read_result(file)["mean_return"]
+        name = learner_label(entrant.name)
         if mean > best.get(name, -np.inf):
             found[name], best[name] = entrant, mean
     return found
 
 
-def many(env_id: str, agent: Any, batches: int, size: int, first: int = FIRST_SEED, **options: Any) -> Array:
+def fast_returns(
+    env_id: str, agent: Any, batches: int, size: int, first: int = FIRST_SEED, **options: Any
+) -> Array:
     """Return a fast policy's returns, in the environment with these keywords."""
     firsts = (first + k * BATCH for k in range(batches))
     return np.concatenate([play(env_id, agent, range(first, first + size), **options) for first in firsts])

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
-from agents.learners import OwnSettings, trainable
+from agents.learners import LearnerSettings, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import FIRST_FRESH_SEED, UserError
 from lag_envs.torch import Step
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-class Settings(OwnSettings):
+class Settings(LearnerSettings):
     """Settings of a training; `lag_envs.hyperparams` has the values."""
 
     learner = NAME
@@ -75,7 +75,7 @@ class Settings(OwnSettings):
 # --- learning -----------------------------------------------------------------------------------------------
 
 
-class Window(NamedTuple):
+class ExperienceWindow(NamedTuple):
     """The experience of n environments in T steps."""
 
     observations: NDArray[np.float32]  #: (T, n, n_observations), before each step
@@ -162,7 +162,7 @@ class Learner:
             state = np.where(self.half_widths > 0.0, self.task.centre + away, self.envs.state)
             self.observation, _ = self.envs.reset(options={"reset_mask": chosen, "state": state})
 
-    def collect(self) -> Window:
+    def collect(self) -> ExperienceWindow:
         """Let the policy act for a window."""
         steps = []
         for _ in range(self.settings.n_steps):
@@ -178,9 +178,9 @@ class Learner:
             if over.any():
                 self.left[over] = self.limit
                 self.start(over)
-        return Window(*(np.stack(x) for x in zip(*steps, strict=True)))
+        return ExperienceWindow(*(np.stack(x) for x in zip(*steps, strict=True)))
 
-    def gradients(self, w: Window) -> Array:
+    def gradients(self, w: ExperienceWindow) -> Array:
         """Return the derivatives by each action of the discounted rewards that follow it, (T, n, n_actions).
 
         They are with respect to the clipped actions. For an episode that is cut, the critic stands for the
@@ -219,7 +219,7 @@ class Learner:
             later = found[t] = total / np.maximum(1.0, size / self.settings.max_slope)
         return found[..., wide:]
 
-    def through_step(self, w: Window, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:
+    def through_step(self, w: ExperienceWindow, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:
         """Convert gradients with respect to steps' results to those with respect to their states and actions.
 
         Each step has several, given as (kinds, T, n, ...), returned as (kinds, T, n, n_state + n_actions).
@@ -245,7 +245,7 @@ class Learner:
         """Return actions as the environment takes them."""
         return np.clip(actions, -self.policy.largest, self.policy.largest).astype(np.float64)
 
-    def update(self, w: Window, by_actions: Array) -> None:
+    def update(self, w: ExperienceWindow, by_actions: Array) -> None:
         """Move the policy along the gradient.
 
         Actions beyond the largest one are moved back, never further out.
@@ -259,7 +259,7 @@ class Learner:
         nn.utils.clip_grad_norm_(self.actor.parameters(), self.settings.max_grad_norm)
         adam.step()
 
-    def learn_values(self, w: Window) -> None:
+    def learn_values(self, w: ExperienceWindow) -> None:
         """Let the critic learn the discounted rewards after each observation, TD(λ)."""
         s = self.settings
         with torch.no_grad():

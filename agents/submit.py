@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learners import LEARNERS, OWN, label
+from agents.learners import LEARNERS, OWN, learner_label
 from agents.optimum import DEFAULT_FOLDER, Solution, nodes, played, solvable
 from agents.run import MODEL, UserError, check_env
 from agents.value_iteration import CacheError
@@ -116,10 +116,10 @@ def optimal(
 # --- all ----------------------------------------------------------------------------------------------------
 
 
-def learned(env_id: str, runs: Path, folder: Path) -> Submission:
+def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
     """Write the finished runs of a learner, in a folder for each seed, as a submission."""
     algo = runs.name
-    name = label(algo) if algo in LEARNERS else algo
+    name = learner_label(algo) if algo in LEARNERS else algo
     origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
     module = OWN[algo][0].removeprefix("agents.") if algo in OWN else "learners"
     made, off, count = export(
@@ -151,12 +151,12 @@ def entrants(env_id: str, runs: Path, cache: Path) -> Iterator[tuple[str, Callab
     for folder in sorted(f for f in (runs / env_id).glob("*") if f.is_dir()):
         finished = len(list(folder.glob(f"seed*/{MODEL}")))
         if finished >= LEARNED_POLICIES:
-            yield folder.name, partial(learned, env_id, folder)
+            yield folder.name, partial(submit_learned, env_id, folder)
         elif finished:
             print(f"{folder}: left out, it has {finished} finished runs, {LEARNED_POLICIES} are needed")
 
 
-def slug(name: str) -> str:
+def folder_part(name: str) -> str:
     """Return a name as part of a folder's."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         envs = [check_env(name) for name in args.envs] if args.envs else boards()
         for env_id in dict.fromkeys(envs):
             for name, make in entrants(env_id, args.runs, args.optimum):
-                folder = args.out / f"{env_id}-{slug(name)}"
+                folder = args.out / f"{env_id}-{folder_part(name)}"
                 print(folder, flush=True)
                 try:
                     if folder.exists():

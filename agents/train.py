@@ -24,7 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from agents.learners import EPISODES, LEARNERS, TESTS, hyperparameters, suits, train
+from agents.learners import EPISODES, LEARNERS, TESTS, suits, train_rest, zoo_hyperparameters
 from agents.run import (
     CHECKPOINT,
     MODEL,
@@ -32,15 +32,15 @@ from agents.run import (
     RESULT,
     Run,
     UserError,
-    check_name,
+    known_name,
     own_env,
     terminable,
 )
 from lag_envs import TASKS, workers
 from lag_envs.own_files import is_file
 from lag_envs.scores import score
-from lag_envs.store import write
-from lag_envs.tables import columns
+from lag_envs.store import write_file
+from lag_envs.tables import aligned
 from lag_envs.workers import SpreadError, check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
@@ -109,14 +109,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a seed failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
     try:
-        runs = plan(args)
+        runs = planned_runs(args)
         todo = [run for run in runs if run.load_result() is None]
         for run in runs:
             if run not in todo:
                 print(f"{run.name}: finished before")
-        parallel_map = partial(on_ray, address=args.ray) if args.ray else partial(processes, jobs=args.jobs)
-        failed, stopped = follow(todo, parallel_map) if todo else ({}, False)
-        summarise([run for run in runs if run.name not in failed])
+        parallel_map = (
+            partial(on_ray, address=args.ray) if args.ray else partial(train_in_processes, jobs=args.jobs)
+        )
+        failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
+        print_returns([run for run in runs if run.name not in failed])
     except UserError as error:
         print(f"agents.train: error: {error}", file=sys.stderr)
         return 2
@@ -127,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 130 if stopped else 1 if failed else 0
 
 
-def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:
+def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:
     """Return the runs that are asked for, with some hyperparameters changed; or raise a UserError."""
     if "all" in args.env and len(args.env) > 1:
         raise UserError(f"all must stand alone, got {' '.join(args.env)}")
@@ -135,7 +137,7 @@ def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType
     sources = {own_env(name): "" if name in TASKS else name for name in given}
     if args.ray and any(map(is_file, given)):
         raise UserError("--ray takes ids and module:ID; a file is not on the other machines")
-    algos = [check_name("algorithm", name, LEARNERS) for name in dict.fromkeys(args.algo)]
+    algos = [known_name("algorithm", name, LEARNERS) for name in dict.fromkeys(args.algo)]
     for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1), ("jobs", 1)):
         value = getattr(args, name)
         if value is not None and not least <= value < 2**31:
@@ -147,7 +149,7 @@ def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType
     for (env, source), algo in product(sources.items(), algos):
         if args.env == ["all"] and not suits(algo, TASKS[env]()):
             continue
-        hyper = {**hyperparameters(algo, env, args.config), **changed}
+        hyper = {**zoo_hyperparameters(algo, env, args.config), **changed}
         try:
             steps = args.steps or int(float(hyper["n_timesteps"]))
         except (KeyError, ValueError, TypeError):
@@ -173,7 +175,7 @@ def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType
 # --- one seed, in a process or on another machine -----------------------------------------------------------
 
 
-def work(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
+def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
     """Train one run and report its progress; return why it failed, or nothing on success.
 
     Parameters
@@ -205,7 +207,7 @@ def work(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
     try:
         if run.source:  # its environment may not be registered in this process yet
             own_env(run.source)
-        train(run, show=show, tested=tested)
+        train_rest(run, show=show, tested=tested)
         send(MODEL, NORMALISATION, RESULT)
     except UserError as error:
         return str(error)
@@ -226,7 +228,7 @@ def _begin(events: Any) -> None:
 
 def _here(run: Run) -> str:
     """Work in a process of its own."""
-    return work(run, _events.put)
+    return train_run(run, _events.put)
 
 
 def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> str:
@@ -234,12 +236,12 @@ def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> s
     with tempfile.TemporaryDirectory() as folder:
         run = Run(**settings | {"folder": Path(folder)})
         if checkpoint is not None:
-            write(run.path(CHECKPOINT), checkpoint)
-        return work(run, events.put, ship=True)
+            write_file(run.path(CHECKPOINT), checkpoint)
+        return train_run(run, events.put, ship=True)
 
 
 @contextmanager
-def processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[Callable]:
+def train_in_processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[Callable]:
     """Train runs in processes; give a function that returns the next event, or None."""
     events = multiprocessing.get_context("spawn").Queue()
     with workers.processes(jobs or os.cpu_count() or 1, _begin, events) as submit:
@@ -248,7 +250,7 @@ def processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[Callable
 
 @contextmanager
 def here(runs: Sequence[Run]) -> Iterator[Callable]:
-    """Train runs in this process, one after the other: nothing is imported twice. Else like `processes`."""
+    """Train runs in this process, one after the other; otherwise like `train_in_processes`."""
     events: queue.Queue = queue.Queue()
     stopped = threading.Event()
 
@@ -259,7 +261,7 @@ def here(runs: Sequence[Run]) -> Iterator[Callable]:
 
     with ThreadPoolExecutor(1) as pool:
         try:
-            yield partial(poll, events, {pool.submit(work, run, tell): run for run in runs})
+            yield partial(poll, events, {pool.submit(train_run, run, tell): run for run in runs})
         finally:
             stopped.set()
             pool.shutdown(cancel_futures=True)
@@ -267,7 +269,7 @@ def here(runs: Sequence[Run]) -> Iterator[Callable]:
 
 @contextmanager
 def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
-    """Train runs on a Ray cluster; otherwise like `processes`."""
+    """Train runs on a Ray cluster; otherwise like `train_in_processes`."""
     try:
         with workers.cluster(address, [Path(__file__).parent]) as submit:
             from ray.util.queue import Queue
@@ -293,7 +295,7 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
         run, error = futures.pop(ended), ended.exception()
         return "end", run.name, ended.result() if error is None else died(error)
     if event[0] == "file":
-        write(next(run for run in futures.values() if run.name == event[1]).path(event[2]), event[3])
+        write_file(next(run for run in futures.values() if run.name == event[1]).path(event[2]), event[3])
         return None
     return event
 
@@ -301,7 +303,7 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
 # --- progress -----------------------------------------------------------------------------------------------
 
 
-def follow(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str], bool]:
+def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str], bool]:
     """Train the runs and show their progress; return the failures, and whether it was stopped."""
     from tqdm import tqdm
 
@@ -354,7 +356,7 @@ def _say(bar: Any, line: str) -> None:
     sys.stdout.flush()
 
 
-def summarise(runs: Sequence[Run]) -> None:
+def print_returns(runs: Sequence[Run]) -> None:
     """Print the runs' returns."""
     for (env, algo), some in groupby(runs, key=lambda run: (run.env, run.algo)):
         results = [(run, result) for run in some if (result := run.load_result()) is not None]
@@ -366,7 +368,7 @@ def summarise(runs: Sequence[Run]) -> None:
             tail = "" if result["score"] is None else f"{result['score']:.3f}"
             trained, seconds, mean = result["trained"], result["wall_seconds"], result["mean_return"]
             rows.append((str(run.seed), f"{trained:,}", f"{seconds:.1f}", f"{mean:.2f}", tail))
-        print("\n".join(columns(rows)))
+        print("\n".join(aligned(rows)))
         print(f"Written to {results[0][0].folder.parent}/")
 
 

@@ -17,18 +17,18 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from agents import learners
-from agents.learners import hyperparameters, load_policy
-from agents.results import ROOT, to_json
+from agents.learners import load_policy, zoo_hyperparameters
+from agents.results import ROOT, results_json
 from agents.run import Run, UserError, check_env, reports_errors, terminable
 from lag_envs import workers
 from lag_envs.controllers import build
 from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
-from lag_envs.evaluation.statistics import rounded
+from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import machine
 from lag_envs.scores import score
-from lag_envs.store import write
-from lag_envs.tables import columns
+from lag_envs.store import write_file
+from lag_envs.tables import aligned
 from lag_envs.tasks import TASKS
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
@@ -91,7 +91,7 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
 # --- settings of a learner ----------------------------------------------------------------------------------
 
 
-def drawn(number: int) -> dict[str, Any]:
+def drawn_changes(number: int) -> dict[str, Any]:
     """Return the changes of a numbered setting; number 0 changes nothing."""
     rng = np.random.default_rng(number)
     changed = {}
@@ -105,10 +105,10 @@ def drawn(number: int) -> dict[str, Any]:
 def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episodes: int) -> dict[str, Any]:
     """Train one seed with changed settings; return its final return and its time."""
     learners.TESTS, learners.EPISODES = 8, 1
-    hyper = {**hyperparameters(LEARNER, env_id), **changed}
+    hyper = {**zoo_hyperparameters(LEARNER, env_id), **changed}
     with tempfile.TemporaryDirectory() as folder:
         run = Run(Path(folder), env_id, LEARNER, seed, steps, hyper)
-        learners.train(run, show=lambda run: None, tested=lambda run: None)
+        learners.train_rest(run, show=lambda run: None, tested=lambda run: None)
         seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + episodes)
         mean = float(play(env_id, load_policy(run.folder), seeds).mean())
     return {
@@ -118,14 +118,16 @@ def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episod
     }  # fmt: skip
 
 
-def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path) -> Any:
+def search_settings(
+    env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path
+) -> Any:
     """Try untried settings, side by side; return everything tried so far."""
-    own = hyperparameters(LEARNER, env_id)
+    own = zoo_hyperparameters(LEARNER, env_id)
     about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
     about["changed_from"] = own
     data = read(file, about) or about | {"machine": machine(), "settings": []}
     for number in range(len(data["settings"]), count):
-        changed = {name: value for name, value in drawn(number).items() if own[name] != value}
+        changed = {name: value for name, value in drawn_changes(number).items() if own[name] != value}
         data["settings"].append({"number": number, "changed": changed, "runs": []})
     with workers.processes(jobs) as submit:
         futures = {}
@@ -134,11 +136,11 @@ def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs:
             for seed in sorted(set(range(seeds)) - done):
                 future = submit(trial, env_id, setting["changed"], seed, steps, episodes)
                 futures[future] = setting, seed
-        for (setting, seed), found in workers.outcomes(futures):
+        for (setting, seed), found in workers.as_they_finish(futures):
             if isinstance(found, BaseException):
                 found = {"seed": seed, "failed": f"{type(found).__name__}: {found}".splitlines()[0]}
-            setting["runs"] = sorted([*setting["runs"], rounded(found)], key=lambda run: run["seed"])
-            write(file, to_json(data))
+            setting["runs"] = sorted([*setting["runs"], rounded_data(found)], key=lambda run: run["seed"])
+            write_file(file, results_json(data))
             how = found.get("failed") or f"return {found['return']:.2f} in {found['seconds']:.0f} s"
             print(f"setting {setting['number']}, seed {seed}: {how}", flush=True)
     return data
@@ -163,7 +165,7 @@ def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
     return data
 
 
-def ranked(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def ranked_cells(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return the cells of a table, best setting first by the mean return over its seeds."""
     rows = []
     for setting in data["settings"]:
@@ -197,7 +199,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--only", metavar="NAME", help="tune this controller only")
     p.add_argument("--episodes", type=int, help="episodes per trial (default 2000, with --settings 200)")
     p.add_argument("--generations", type=int, default=15, help="default %(default)s")
-    p.add_argument("--settings", type=int, metavar="N", help=f"try so many settings of {LEARNER} instead")
+    p.add_argument("--settings", type=int, metavar="N", help=f"try this many settings of {LEARNER} instead")
     p.add_argument("--steps", type=int, help="steps of each training (default n_timesteps)")
     p.add_argument("--seeds", type=int, default=2, help="trainings with each setting (default %(default)s)")
     p.add_argument("--jobs", type=int, default=1, help="trainings at once (default %(default)s)")
@@ -214,17 +216,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if (value := getattr(args, name)) is not None and value < 1:
             raise UserError(f"--{name} must be at least 1, got {value}")
     if args.settings:
-        steps = args.steps or int(hyperparameters(LEARNER, args.env)["n_timesteps"])
+        steps = args.steps or int(zoo_hyperparameters(LEARNER, args.env)["n_timesteps"])
         file = args.output or RESULTS / f"{args.env}.json"
         try:
             with terminable():
-                data = search(
+                data = search_settings(
                     args.env, args.settings, args.seeds, steps, args.episodes or 200, args.jobs, file
                 )
         except KeyboardInterrupt:
             print("\nStopped. What was tried is kept; re-run the command to resume.", file=sys.stderr)
             return 130
-        print("\n" + "\n".join(columns(ranked(data))))
+        print("\n" + "\n".join(aligned(ranked_cells(data))))
         hours = 5 * 5e6 / pace(data) / 3600.0
         print(
             f"{pace(data):,.0f} steps in a second of the processor, {hours:.2f} h for five seeds of 5M steps"

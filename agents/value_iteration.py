@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.stepping.cache import jit
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 Array = NDArray[np.float64]
 #: (points (n, d), actions (n,)) to (coordinates (n, d), rewards (n,), ended (n,)).
@@ -169,7 +169,7 @@ def interpolate_rows(values: Any, times: Any, cells: Any, places: Any, strides: 
 
 
 @jit
-def carried(x: Any, nodes: Any, own: Any, others: Any) -> Any:
+def regridded(x: Any, nodes: Any, own: Any, others: Any) -> Any:
     """Carry each x from its own axis, ``nodes[own[i]]``, to the same place among the nodes `others`."""
     out = np.empty(len(x))
     for i in range(len(x)):
@@ -249,7 +249,7 @@ def _expect(weights: Any, cells: Any, places: Any, strides: Any, values: Any, ex
         expected[i] = total
 
 
-class ValueIteration:
+class DynamicProgramme:
     """A dynamic programme: its grid and its steps.
 
     Parameters
@@ -332,7 +332,7 @@ class ValueIteration:
         quiet : bool
             Whether to hide the progress bar.
         """
-        cache = None if folder is None else Cache(folder / self.name, self, new)
+        cache = None if folder is None else ValueCache(folder / self.name, self, new)
         values = np.zeros((self.steps + 1, self.grid.size), np.float32) if cache is None else cache.values
         done = self.steps if cache is None else cache.done
         self.seconds = 0.0 if cache is None else cache.seconds
@@ -341,7 +341,7 @@ class ValueIteration:
         return values.reshape(-1, *self.grid.shape)
 
     def _sweep_back(
-        self, values: NDArray[np.float32], done: int, cache: Cache | None, label: str, quiet: bool
+        self, values: NDArray[np.float32], done: int, cache: ValueCache | None, label: str, quiet: bool
     ) -> None:
         from tqdm import tqdm
 
@@ -393,7 +393,7 @@ class ValueIteration:
 # --- the cache ----------------------------------------------------------------------------------------------
 
 
-class Cache:
+class ValueCache:
     """The values in a folder: ``values.npy``, a memory-mapped array, and ``progress.json``, its progress.
 
     The progress file is replaced as a whole, and only after its values are written: after a kill at any
@@ -405,7 +405,7 @@ class Cache:
         For files that are damaged or belong to something else, and a disk without room for them.
     """
 
-    def __init__(self, folder: Path, problem: ValueIteration, new: bool = False) -> None:
+    def __init__(self, folder: Path, problem: DynamicProgramme, new: bool = False) -> None:
         self.folder, self.parameters = folder, problem.parameters
         self.done, self.seconds = problem.steps, 0.0
         shape = (problem.steps + 1, problem.grid.size)
@@ -462,4 +462,4 @@ class Cache:
             "parameters": self.parameters, "done": done, "seconds": round(seconds, 3),
             "check": zlib.crc32(self.values[done]),
         }  # fmt: skip
-        write(self.folder / PROGRESS, json.dumps(progress, indent=1) + "\n")
+        write_file(self.folder / PROGRESS, json.dumps(progress, indent=1) + "\n")

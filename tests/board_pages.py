@@ -129,6 +129,6 @@ def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.i
 
 
 if __name__ == "__main__":
-    from lag_envs.leaderboard.site.build import build
+    from lag_envs.leaderboard.site.build import write_page
 
-    build(data(tuple(TASKS)), Path(sys.argv[1]))
+    write_page(data(tuple(TASKS)), Path(sys.argv[1]))

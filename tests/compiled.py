@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lag_envs.device import DeviceEnvs, address
+from lag_envs.device import DeviceEnvs, kernel_argument
 from lag_envs.envs.kernels import APART
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
@@ -36,7 +36,7 @@ def load(source, device, single):
     made = library(source)
 
     def launch(name, count, *arguments):
-        getattr(made, name)(*(ctypes.c_longlong(x) for x in (count, *map(address, arguments))))
+        getattr(made, name)(*(ctypes.c_longlong(x) for x in (count, *map(kernel_argument, arguments))))
 
     return launch
 

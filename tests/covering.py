@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
@@ -47,11 +48,11 @@ def every(n: int, cases: Iterable[Any]) -> list[Any]:
 def features(kind: type[Task]) -> frozenset[str]:
     """Return the features of a task's record on which code depends, in words."""
     task = kind()
-    formulas, form = task.formulas, task.scene._form
+    formulas, form = task.formulas, form_of(task.scene)
     own = {name for name in vars(Task) if getattr(kind, name) is not getattr(Task, name)}
     found = {name for name in own - WORDS_AND_NUMBERS if not name.startswith("_")}
     found |= {f"variant: {name}" for name in kind.examples.variants}
-    found |= {f"control: {held.level}" for held in task.scene._layout.prescribed if held.level}
+    found |= {f"control: {held.level}" for held in layout_of(task.scene).prescribed if held.level}
     found.add(f"engine: {form.kind.__name__ if form else 'series'}")
     found.add(f"{formulas.actions} actions, {'listed' if formulas.choices else 'ranges'}")
     found.add(f"{formulas.targets} targets")
@@ -63,14 +64,14 @@ def features(kind: type[Task]) -> frozenset[str]:
 @cache
 def engine(kind: type[Task]) -> frozenset[str]:
     """Return the features that decide how a step is printed, apart from its formulas."""
-    form = kind().scene._form
+    form = form_of(kind().scene)
     return frozenset(["imperfect" if kind.imperfections else form.kind.__name__ if form else "series"])
 
 
 @cache
 def size(kind: type[Task]) -> int:
     """Return how many coordinates a task's scene has."""
-    return len(kind().scene._layout.free)
+    return len(layout_of(kind().scene).free)
 
 
 def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:

@@ -5,14 +5,14 @@ import time
 
 from matplotlib.figure import Figure
 
-from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.runner import Job
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
+from lag_envs.report.runner import ReportJob
 
 SECTION = "tests.dummy_section"
 
 
 def job(name, function="numbers", timeout=60.0, **arguments):
-    return Job(SECTION, name, f"{SECTION}:{function}", arguments, timeout)
+    return ReportJob(SECTION, name, f"{SECTION}:{function}", arguments, timeout)
 
 
 def jobs(quick):
@@ -69,7 +69,10 @@ def content(rows, problems):
         "Dummies & more",
         ["What <b>is</b> said."],
         [table],
-        [Picture("dummy", "A line. It goes up.", draw), Picture("dots", "Dots.", draw, raster=True)],
+        [
+            ReportFigure("dummy", "A line. It goes up.", draw),
+            ReportFigure("dots", "Dots.", draw, raster=True),
+        ],
         [Claim("There are five.", len(rows) == 5, f"{len(rows)} found"), Claim("Nothing.", None, "")],
         Table("few", "How many:", ("rows",), [(len(rows),)]),
         [Table("all-dummies", "All of them", ("number",), [(row["number"],) for row in rows])],

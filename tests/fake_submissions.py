@@ -121,6 +121,6 @@ def install(put=setattr):
     for name in ("read_files", "digest_of", "about", "load"):
         put(submission, name, globals()[name])
     put(verify, "verify", recompute)
-    put(verify, "replay", replay)
+    put(verify, "record_again", replay)
     put(alike, "Likeness", Likeness)
     put(alike, "check_twins", lambda found, nonce: None)

@@ -10,6 +10,7 @@ import numpy as np
 from mpmath import mp, mpf
 
 from lag_envs import scenes
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report import reference
 from lag_envs.report.oracle import Oracle
 from lag_envs.report.stepped import Stepped
@@ -24,7 +25,7 @@ def scene_of(name, params):
 
 def flow(scene_name, params, state, control, dt, dps=40):
     """Return the state after one step with the control held, with dps - 10 digits at least."""
-    return reference.flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
+    return reference.exact_flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
 
 
 def moving_plane(k, beta, gravity, radius, tilt_rate, state, dt):
@@ -131,7 +132,7 @@ def conditioning(scene_name, params, state, control, dt, include_params=False):
                 moved = [[*state[:j], value + sign * EPS * size, *state[j + 1 :]] for sign in (1, -1)]
                 count(*((oracle, y, control) for y in moved))
         if include_params:
-            for name in scene._numbers():
+            for name in parameter_names(scene):
                 value = getattr(scene, name)
                 if value and value != inf:
                     factors = (1 + Fraction(EPS), 1 - Fraction(EPS))

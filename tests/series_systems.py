@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.report.oracle import solve
+from lag_envs.report.oracle import solve_positive
 from lag_envs.scenes.base import Scene, parameter
 
 
@@ -333,4 +333,4 @@ SYSTEMS = (
 
 def acceleration(system: System, q: list, v: list, u: list, s: Any, a: Any, xp: Any) -> list:
     """Return the accelerations, for numbers of any kind."""
-    return solve(*system.motion(q, v, u, s, a, xp))
+    return solve_positive(*system.motion(q, v, u, s, a, xp))

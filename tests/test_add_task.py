@@ -18,20 +18,21 @@ from toy_pendulum import Pendulum, Swing
 
 from agents import behaviour, results, scale, submit, train
 from agents.learners import load_policy
-from agents.report import page
+from agents.report import agents_page
 from lag_envs import TASKS, cli, register
 from lag_envs.controllers import controllers, make_controller
 from lag_envs.controllers.basic import ObservationDecoder
-from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.pending import finish
-from lag_envs.leaderboard.site.build import build
+from lag_envs.leaderboard.site.build import write_page
 from lag_envs.leaderboard.standings import page_data
 from lag_envs.leaderboard.submission import load
+from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.scores import known_returns
-from lag_envs.tasks import find, measured
+from lag_envs.tasks import find_tasks, measured
 from tools.docs import environments
 
 ROOT = Path(__file__).parents[1]
@@ -54,7 +55,7 @@ def file(tmp_path_factory):
 @pytest.fixture
 def task(file, tmp_path, monkeypatch):
     """Find the file's task like those of the package, and return its class."""
-    places = find(file.parent, "")
+    places = find_tasks(file.parent, "")
     assert places == {ID: "two_link_arm:Reach"}
     monkeypatch.syspath_prepend(str(file.parent))
     monkeypatch.setitem(TASKS.data, ID, places[ID])
@@ -67,7 +68,7 @@ def task(file, tmp_path, monkeypatch):
 
 @pytest.fixture
 def scaled(task, tmp_path, monkeypatch):
-    """Measure its score scale into a file, and have the file read."""
+    """Measure its score scale, write it to a file, and let the package read that file."""
     monkeypatch.setattr(scale, "BATCH", 200)
     path = tmp_path / "measured.json"
     assert scale.main([ID, "--batches", "1", "--output", str(path)]) == 0
@@ -90,8 +91,8 @@ def test_vector_is_single(task):
     for envs in (single, native):
         envs.reset(seed=5)
     for a in actions(250, 3, 2):
-        for ours, theirs in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+        for batched, alone in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
+            np.testing.assert_array_equal(batched, alone)
 
 
 def test_controllers(task):
@@ -121,7 +122,7 @@ def test_commands(task, file, capsys):
 
 def test_docs_page(task):
     """Its page, though it has neither prose nor results yet."""
-    page = environments.page(ID)
+    page = environments.environment_page(ID)
     headings = re.findall("^## (.+)$", page, re.MULTILINE)
     assert headings == [name for name in environments.HEADINGS if name in headings]
     assert {"Action Space", "Observation Space", "Arguments", "Equations"} <= set(headings)
@@ -153,13 +154,15 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     data = results.load_summary(output, needed=True)
     assert set(data["envs"][ID]["agents"]) == {"zero", "random", "springs", "fast_ppo"}
     text = (output / "docs" / "agents.md").read_text(encoding="utf-8")
-    assert text == page(data) and f"## {ID}" in text and task.note in text and "springs, the best" in text
-    found = behaviour.measures(record(Rollout(ID, make_controller(ID, "springs"), range(20))))
+    assert (
+        text == agents_page(data) and f"## {ID}" in text and task.note in text and "springs, the best" in text
+    )
+    found = behaviour.measures(record_rollout(Rollout(ID, make_controller(ID, "springs"), range(20))))
     assert found["there after [s]"] < 1.5 and found["episodes without"] < 10
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 2)
-    learned = submit.learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
+    learned = submit.submit_learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
     assert learned.code.endswith("/agents/ppo.py")
     for name in controllers(task):
         submit.controller(ID, name, tmp_path / name)
@@ -181,7 +184,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     assert [finding.wrong for finding in findings if finding.wrong] == []
 
     # Its page, and its entries in README and docs.
-    build(data | {"environments": [shown]}, tmp_path / "site")
+    write_page(data | {"environments": [shown]}, tmp_path / "site")
     assert "springs" in (tmp_path / "site" / f"{ID}.html").read_text(encoding="utf-8")
     assert f"| {ID} | Success: both joints" in docs.goals()
 
@@ -200,7 +203,7 @@ def toy():
 
 def test_it_is_recognised_as_a_driven_pendulum():
     scene = Pendulum(mass=0.7, length=0.4, damping=0.05)
-    drive = scene._form.coefficients([0.3, 1.0], [2.0], scene._constants())
+    drive = form_of(scene).coefficients([0.3, 1.0], [2.0], motion_constants_of(scene))
     per_torque = 1.0 / (0.7 * 0.4**2)
     assert drive == pytest.approx((9.81 / 0.4, 0.0, 0.05 * per_torque, 2.0 * per_torque, 0.0), rel=1e-15)
 
@@ -239,8 +242,8 @@ def test_the_toy_as_an_environment(toy):
     for envs in (single, native):
         envs.reset(seed=5)
     for a in actions(700, 3, 1):
-        for ours, theirs in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+        for batched, alone in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
+            np.testing.assert_array_equal(batched, alone)
     check_env(gym.make(TOY, damping=0.2).unwrapped, skip_render_check=not RENDERS)
     with pytest.raises(ValueError, match="length must be above 0 m, got -1 m"):
         gym.make(TOY, length=-1.0)

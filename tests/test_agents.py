@@ -20,7 +20,7 @@ from lag_envs.evaluation.rollout import play
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 from tools.missing import have
 
 ROOT = Path(__file__).parents[1]
@@ -40,11 +40,11 @@ def test_score():
 
 def pair(env_id, n=3, seed=7, **options):
     """Return the adapter and SB3's own vector environment over single ones, seeded alike."""
-    ours = make_vec_env(env_id, n, **options)
-    theirs = DummyVecEnv([lambda: gym.make(env_id, **options)] * n)
-    for envs in (ours, theirs):
+    adapter = make_vec_env(env_id, n, **options)
+    dummy = DummyVecEnv([lambda: gym.make(env_id, **options)] * n)
+    for envs in (adapter, dummy):
         envs.seed(seed)
-    return ours, theirs
+    return adapter, dummy
 
 
 @pytest.mark.parametrize(
@@ -55,15 +55,15 @@ def pair(env_id, n=3, seed=7, **options):
     ],
 )
 def test_adapter_equals_dummy_vec_env(env_id, options):
-    ours, theirs = pair(env_id, **options)
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    assert ours.reset().tobytes() == theirs.reset().tobytes()
+    adapter, dummy = pair(env_id, **options)
+    assert adapter.observation_space == dummy.observation_space
+    assert adapter.action_space == dummy.action_space
+    assert adapter.reset().tobytes() == dummy.reset().tobytes()
     rng = np.random.default_rng(0)
     ends = {True: 0, False: 0}
     for _ in range(450):
         actions = rng.uniform(-1.0, 1.0, (3, 1)).astype(np.float32)
-        (o1, r1, d1, i1), (o2, r2, d2, i2) = ours.step(actions), theirs.step(actions)
+        (o1, r1, d1, i1), (o2, r2, d2, i2) = adapter.step(actions), dummy.step(actions)
         assert (o1.tobytes(), r1.tobytes(), d1.tobytes()) == (o2.tobytes(), r2.tobytes(), d2.tobytes())
         assert (o1.dtype, r1.dtype, d1.dtype) == (o2.dtype, r2.dtype, d2.dtype)
         for a, b, done in zip(i1, i2, d1, strict=True):
@@ -74,28 +74,28 @@ def test_adapter_equals_dummy_vec_env(env_id, options):
             else:
                 assert a == {}
     assert sum(ends.values()) >= 6
-    # Without seeds a reset goes on with the next episodes.
-    assert ours.reset().tobytes() == theirs.reset().tobytes()
+    # Without seeds a reset continues with the next episodes.
+    assert adapter.reset().tobytes() == dummy.reset().tobytes()
 
 
 def test_adapter_passes_options_and_infos_on():
-    ours, theirs = pair(ENV, diagnostics=True, duration=0.1)
-    for envs in (ours, theirs):
+    adapter, dummy = pair(ENV, diagnostics=True, duration=0.1)
+    for envs in (adapter, dummy):
         envs.set_options({"state": [0.1, 0.0, 3.0, 0.0]})
-    assert ours.reset().tobytes() == theirs.reset().tobytes()
-    np.testing.assert_array_equal(ours.get_attr("state"), [[0.1, 0.0, 3.0, 0.0]] * 3)
+    assert adapter.reset().tobytes() == dummy.reset().tobytes()
+    np.testing.assert_array_equal(adapter.get_attr("state"), [[0.1, 0.0, 3.0, 0.0]] * 3)
     for _ in range(7):
-        _, _, _, i1 = ours.step(np.ones((3, 1), np.float32))
-        _, _, _, i2 = theirs.step(np.ones((3, 1), np.float32))
+        _, _, _, i1 = adapter.step(np.ones((3, 1), np.float32))
+        _, _, _, i2 = dummy.step(np.ones((3, 1), np.float32))
         for a, b in zip(i1, i2, strict=True):
             b.pop("TimeLimit.truncated")
             a.pop("TimeLimit.truncated", None)
             assert set(a) == set(b)
             for name in a:
                 np.testing.assert_allclose(a[name], b[name], rtol=1e-12, atol=1e-12)
-    ours.set_options([{"state": [0.0, 0.0, 0.0, 0.0]}, {}, {}])
+    adapter.set_options([{"state": [0.0, 0.0, 0.0, 0.0]}, {}, {}])
     with pytest.raises(ValueError, match="all environments are given the same"):
-        ours.reset()
+        adapter.reset()
 
 
 def test_adapter_attributes():
@@ -219,7 +219,7 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "ADAPTER", tmp_path / "adapter.json")
     assert bench.main(["--rounds", "1", "--output", str(report.ADAPTER)]) == 0
     assert "DummyVecEnv" in capsys.readouterr().out
-    assert "| step | 2 | " in report.adapter() and "| PPO | 16 | " in report.adapter()
+    assert "| step | 2 | " in report.adapter_rates() and "| PPO | 16 | " in report.adapter_rates()
     assert bench.main(["--rounds", "0"]) == 2
 
 
@@ -263,7 +263,7 @@ def test_scale_plans_in_few_episodes(monkeypatch, capsys, tmp_path):
 
 def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
     """The best seed of each plays; the best known one keeps its numbers if it no longer exists."""
-    env_id, runs, before = incline.Brake.id, tmp_path / "runs", measured(incline.Brake.id)
+    env_id, runs, before = incline.Brake.id, tmp_path / "runs", measured_entry(incline.Brake.id)
     for seed, (push, mean) in enumerate([(-1.0, -12.0), (1.0, -2.0), (0.5, -3.0)]):
         folder = runs / env_id / "fast_ppo" / f"seed{seed}"
         folder.mkdir(parents=True)
@@ -272,13 +272,13 @@ def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
         result = {"schema": 1, "env": env_id, "algo": "fast_ppo", "seed": seed, "trained": 1, "steps": 1}
         result |= {"wall_seconds": 1.0, "mean_return": mean, "score": 0.0, "curve": [], "hyperparameters": {}}
         (folder / "result.json").write_text(json.dumps(result | {"evaluation": {"returns": []}}))
-    new = scale.measured(env_id, 1, True, {}, 100, runs=runs)
+    new = scale.measure_environment(env_id, 1, True, {}, 100, runs=runs)
     constant = make_controller(env_id, "full damping")
     expected = play(env_id, constant, range(scale.FIRST_SEED, scale.FIRST_SEED + 100)).mean()
     assert new["measured"]["fast PPO"]["mean"] == pytest.approx(expected, abs=1e-6)
     assert new["scale"]["policy"] == before["scale"]["policy"]
     best = before | {"scale": new["scale"] | {"policy": "fast PPO"}, "measured": new["measured"]}
     capsys.readouterr()
-    gone = scale.measured(env_id, 1, True, best, 100, runs=tmp_path / "none")
+    gone = scale.measure_environment(env_id, 1, True, best, 100, runs=tmp_path / "none")
     assert gone["measured"]["fast PPO"] == new["measured"]["fast PPO"]
     assert "fast PPO             is not in" in capsys.readouterr().out

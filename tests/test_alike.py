@@ -127,7 +127,7 @@ def changed(submission, change, folder, seed=0):
 # --- our own ------------------------------------------------------------------------------------------------
 
 
-def ours(kind="learned"):
+def own_entries(kind="learned"):
     """Return the submissions of a kind on the repository's board, by id."""
     return sorted(entry.id for entry in BOARD.read().all if entry.kind == kind and entry.protocol == 1)
 
@@ -144,7 +144,7 @@ QUICK = (f"{incline.Brake.id}-ppo", f"{cylinder_in_cylinder.Pump.id}-td3")
 
 
 @pytest.mark.parametrize(
-    "id", [pytest.param(i, marks=[] if i.startswith(QUICK) else pytest.mark.slow) for i in ours()]
+    "id", [pytest.param(i, marks=[] if i.startswith(QUICK) else pytest.mark.slow) for i in own_entries()]
 )
 def test_a_changed_copy_of_a_learner_is_found(id, tmp_path):
     """Those that are most sensitive to noise are among the quick ones."""
@@ -163,7 +163,7 @@ def test_a_changed_copy_of_a_learner_is_found(id, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("env", sorted({entry.env for entry in BOARD.read().all}))
 @pytest.mark.parametrize("nonce", ["one", "another"])
-def test_ours_are_all_different(env, nonce):
+def test_own_entries_are_all_different(env, nonce):
     """And not just barely."""
     state = BOARD.read()
     neighbours = Neighbours(BOARD)
@@ -177,10 +177,10 @@ def test_ours_are_all_different(env, nonce):
 
 def test_trainings_are_different_though_all_else_is_the_same():
     """The closest two policies of our own are among these."""
-    submission = load(BOARD.submission(next(i for i in ours() if i.startswith(QUICK[0]))))
+    submission = load(BOARD.submission(next(i for i in own_entries() if i.startswith(QUICK[0]))))
     check_twins(submission, "a nonce")
     tracks = Likeness(submission.env, "a nonce").tracks(submission)
-    error = error_of(next(i for i in ours() if i.startswith(QUICK[0])))
+    error = error_of(next(i for i in own_entries() if i.startswith(QUICK[0])))
     found = [alike.distance(a, b, error) for i, a in enumerate(tracks) for b in tracks[:i]]
     assert min(distance.closeness for distance in found) > 1.2
 

@@ -86,6 +86,49 @@ def is_private(name):
     return name.startswith("_") and not name.startswith("__")
 
 
+#: Private names of other libraries, which offer no other way, or expect a subclass to use them.
+OTHERS_PRIVATE = {
+    "_SubParsersAction", "_actions",  # argparse: the parsers of subcommands
+    "_add_info",  # Gymnasium's VectorEnv
+    "_assumptions_orig",  # SymPy's symbols
+    "_exit",  # os
+    "_get_indices", "_options", "_reset_options", "_reset_seeds", "_seeds",  # Stable-Baselines3's VecEnv
+    "_getvalue",  # Numba's arrays
+    "_mpf_",  # mpmath's numbers
+    "_asdict", "_fields", "_replace",  # named tuples: public, the underscore avoids names of fields
+}  # fmt: skip
+
+
+def package_of(path):
+    """Return the layer that a file belongs to: a folder, or the file itself."""
+    return path.relative_to(SOURCE / "lag_envs" if SOURCE in path.parents else ROOT).parts[0]
+
+
+def defined(whole):
+    """Return the attributes that a file defines: methods, fields, what is assigned to an object."""
+    for node in ast.walk(whole):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Attribute | ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.attr if isinstance(node, ast.Attribute) else node.id
+        elif isinstance(node, ast.Constant):  # of `object.__setattr__`
+            yield node.value
+
+
+def test_private_attributes_stay_in_their_file_and_those_of_self_in_their_package():
+    """A class may use what a base class in the same package keeps for itself; nobody else may."""
+    files = {path: set(defined(tree(path))) for path in [*FILES.values(), *OTHERS]}
+    packages = {}
+    for path, names in files.items():
+        packages.setdefault(package_of(path), set()).update(names)
+    for path, own in files.items():
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Attribute) and is_private(node.attr):
+                inside = ast.unparse(node.value) in ("self", "cls", "super()")
+                known = packages[package_of(path)] if inside else own
+                assert node.attr in known | OTHERS_PRIVATE, f"{path}:{node.lineno}: {ast.unparse(node)}"
+
+
 def test_the_architectures_page_names_what_exists():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     package = SOURCE / "lag_envs"

@@ -228,8 +228,8 @@ def test_a_result_is_edited_so_that_it_agrees_with_itself(board):
     ],
 )  # fmt: skip
 def test_part_of_a_result_is_edited(board, change, check, monkeypatch):
-    monkeypatch.setattr("lag_envs.leaderboard.results.build", lambda: "0" * 64)
-    monkeypatch.setattr(audit, "build", lambda: "0" * 64)
+    monkeypatch.setattr("lag_envs.leaderboard.results.code_digest", lambda: "0" * 64)
+    monkeypatch.setattr(audit, "code_digest", lambda: "0" * 64)
     relog(board, edit(board, change))
     shutil.rmtree(board.folder.parent / ".git")
     assert bool(refused(board)) == (check == "cheap")
@@ -273,7 +273,7 @@ LOG = {
 
 @needs_git
 @pytest.mark.parametrize("how", LOG)
-@pytest.mark.parametrize("chain", [False, True], ids=["by hand", "with the chain made anew"])
+@pytest.mark.parametrize("chain", [False, True], ids=["by hand", "with the chain rebuilt"])
 def test_the_log_is_edited(board, how, chain):
     before = board.log.read_bytes()
     told = lines(board)

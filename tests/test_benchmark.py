@@ -18,12 +18,13 @@ from lag_envs.benchmark import cold_start, contestants, divisions, docs, energie
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import stagger_episodes
-from lag_envs.benchmark.measurement import Settings, bench
+from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.benchmark.peak import PRODUCTS
-from lag_envs.benchmark.results import quartiles, ratios, summary
-from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure
+from lag_envs.benchmark.results import quartiles, ratios, row_summary
+from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure_rates
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, has_own_flow, verdicts
 from lag_envs.scenes import CartPole
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import count_operations, record_block
 from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
@@ -145,7 +146,9 @@ def test_a_reader_that_leaves_is_no_error(tmp_path):
 def tiny(tmp_path, **changes):
     """Return settings for a measurement of minimal length."""
     some = {"ids": (ID,), "sizes": (1, 3), "rounds": 2, "seconds": 1e-4, "cold_starts": 0}
-    return Settings(**(some | {"date": "2020-02-20", "output": str(tmp_path / "speed.json")} | changes))
+    return BenchmarkSettings(
+        **(some | {"date": "2020-02-20", "output": str(tmp_path / "speed.json")} | changes)
+    )
 
 
 def broken(n):
@@ -176,9 +179,9 @@ def test_bench_writes_json_and_goes_on_past_failing_peers(tmp_path, capsys, monk
     assert report["versions"].keys() >= {"lag_envs", "gymnasium", "numpy", "numba"}
     assert report["machine"].keys() >= {"processor", "cores", "system", "python"}
     for kind, n in (("made", 1), ("unwrapped", 1), ("vector", 1), ("vector", 3)):
-        ours = row(report, ID, kind, n)
-        assert len(ours["rates"]) == 2 and all(rate > 0.0 for rate in ours["rates"])
-        assert len(ours["ratio"]) == 3
+        measured = row(report, ID, kind, n)
+        assert len(measured["rates"]) == 2 and all(rate > 0.0 for rate in measured["rates"])
+        assert len(measured["ratio"]) == 3
     assert row(report, "CartPole-v1", "made")["ratio"] == [1.0, 1.0, 1.0]
     assert row(report, "Pendulum-v1", "made")["rates"]
 
@@ -206,7 +209,7 @@ def test_a_peer_that_fails_later_keeps_its_samples():
     rows = [
         Contestant("gone", f"Peer{i}", "vector", 2, lambda run=run: run) for i, run in enumerate((fails, int))
     ]
-    assert measure(rows, 3, 1e-9)
+    assert measure_rates(rows, 3, 1e-9)
     assert rows[0].problem == "failed: ZeroDivisionError: late"
     assert [len(row.rates) for row in rows] == [1, 3]
 
@@ -302,7 +305,7 @@ def test_how_often_steps_are_divided(tmp_path, capsys):
     assert two["most"] > 5 and 1.5 < two["mean"] < two["most"] and 0.5 < two["divided"] < 1.0
     assert two["fastest"] > 20.0
     assert "series a step" in capsys.readouterr().out
-    text = divisions.markdown(report["divisions"], {two["id"]: 100.0 * two["mean"]})
+    text = divisions.divisions_markdown(report["divisions"], {two["id"]: 100.0 * two["mean"]})
     assert text.splitlines()[2].endswith("| 100 ns |") and ID not in text
 
 
@@ -324,22 +327,22 @@ def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
 
     from lag_envs.envs.single import LagrangianEnv
 
-    ours = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
-    theirs = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
-    theirs.tau = 1e-4
+    twin = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
+    original = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
+    original.tau = 1e-4
     start = np.array([0.01, -0.02, 0.03, 0.04])
-    ours.reset(options={"state": start})
-    theirs.reset(seed=0)
-    theirs.state = start
+    twin.reset(options={"state": start})
+    original.reset(seed=0)
+    original.state = start
     for i in range(20_000):
         action = (i // 700) % 2
-        a, b = ours.step(action), theirs.step(action)
+        a, b = twin.step(action), original.step(action)
         assert a[2] == b[2] or abs(abs(a[0][2]) - np.radians(12.0)) < 2e-3
         if a[2] or b[2]:
             break
     assert i > 1000
     np.testing.assert_allclose(a[0], b[0], atol=5e-3)
-    assert ours.action_space == theirs.action_space
+    assert twin.action_space == original.action_space
 
 
 # --- statistics on known numbers ---
@@ -364,7 +367,7 @@ def test_rows_are_compared_with_cartpole_of_their_size():
         made("lag_envs", ID, "vector", 64, [700.0, 1000.0]),
         made("lag_envs", ID, "vector", 7, [1.0, 1.0]),
     ]
-    results = [summary(r, rows) for r in rows]
+    results = [row_summary(r, rows) for r in rows]
     assert results[3]["ratio"] == (3.0, 3.0, 3.0)
     assert results[4]["ratio"] == (5.5, 6.0, 6.5)
     assert results[4]["steps_per_second"] == (775.0, 850.0, 925.0)
@@ -393,7 +396,7 @@ def test_who_has_a_target():
     assert all(meant(target) for target in TARGETS) and not any(meant(target) for target in SERIES_TARGETS)
     assert not meant(TARGETS[1], num_envs=1) and not meant(TARGETS[1], library="gymnasium")
     unknown = [id for id, task in TASKS.items() if task.imperfections]
-    general = [id for id, task in TASKS.items() if task().scene._form is None]
+    general = [id for id, task in TASKS.items() if form_of(task().scene) is None]
     assert unknown and general and not any(has_own_flow(id) for id in (*unknown, *general, "Other-v0"))
     for target in SERIES_TARGETS:
         assert meant(target, library=ENERGIES, id=target.id) and not meant(target, id=target.id)
@@ -408,7 +411,7 @@ def report_of(ratios):
         rows[-1].problem = None if ratio else "failed: OSError: no luck"
     return {
         "date": "2020-02-20", "machine": {"processor": "P"}, "versions": {"gymnasium": "1"},
-        "settings": {"rounds": 1, "clock": "wall"}, "rows": [summary(r, rows) for r in rows],
+        "settings": {"rounds": 1, "clock": "wall"}, "rows": [row_summary(r, rows) for r in rows],
         "cold_start": {"empty": {"median": 1.234}},
     }  # fmt: skip
 
@@ -420,7 +423,7 @@ def test_checkout_takes_the_table_over(tmp_path):
         (tmp_path / name).write_text(marks)
     report = report_of([2.0, 5.99, 20.0, 1.5])
     docs.take_over(report, tmp_path)
-    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(docs.to_json(report))
+    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(docs.report_json(report))
     text = (tmp_path / "docs" / "speed.md").read_text()
     assert (
         f"| {ID} | 50 ns, 2.0× | 16.7 ns, **5.99×, missed** | 5 ns, 20.0× | 66.7 ns, **1.50×, missed** |"
@@ -433,12 +436,12 @@ def test_checkout_takes_the_table_over(tmp_path):
         assert "| a flow of their own | 2 to 2 | 6 to 6 | 20 to 20 | 1.5 to 1.5 |" in text
         assert "general series" not in text and "2 of 4 targets are missed" in text
     assert "All targets are met" in docs.claim(report_of([2.0, 6.0, 3.0, 3.0]))
-    assert "| failed: OSError: no luck |" in docs.markdown(report_of([2.0, 6.0, None, 3.0]))
+    assert "| failed: OSError: no luck |" in docs.speed_markdown(report_of([2.0, 6.0, None, 3.0]))
 
 
 def test_what_was_broken_off_is_not_taken_over(tmp_path, monkeypatch):
     monkeypatch.setattr(contestants, "PEERS", contestants.PEERS[:1])
-    monkeypatch.setattr(measurement, "measure", lambda *_: False)
+    monkeypatch.setattr(measurement, "measure_rates", lambda *_: False)
     monkeypatch.setattr(measurement, "take_over", lambda *_: pytest.fail("taken over"))
     assert not bench(tiny(tmp_path, checkout=str(tmp_path)))["complete"]
 

@@ -20,7 +20,7 @@ from lag_envs import scores
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import protocol, ranking, standings, submission
 from lag_envs.leaderboard.board import Board, BoardError, closed, id_of
-from lag_envs.leaderboard.log import Line, fold, parse
+from lag_envs.leaderboard.log import LogLine, fold, parse
 from lag_envs.leaderboard.parallel import map_submissions, packed
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
@@ -343,14 +343,14 @@ def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
     joined = board.read().protocols[1]
     assert set(joined.scales) == set(protocol.boards()) and joined.rules.model_dump() == protocol.rules()
     assert joined.references.keys() == {id for id in protocol.boards() if protocol.reference(id)}
-    assert states(board) == {old: "verified"}  # nothing is verified anew
+    assert states(board) == {old: "verified"}  # nothing is verified again
     assert board_data(board, "today")["environments"][0] == shown
     other = add(board, env=new, nonce="2")
     assert states(board) == {old: "verified", other: "verified"}
     told = next(line for line in parse(board.log.read_bytes())[0] if line.event.event == "opened")
     again = [
         *parse(board.log.read_bytes())[0],
-        Line(99, told.event.model_copy(update={"at": board.read().last})),
+        LogLine(99, told.event.model_copy(update={"at": board.read().last})),
     ]
     with pytest.raises(BoardError, match=f"{new} joins protocol 1, and has a board there already"):
         fold(again)
@@ -587,20 +587,20 @@ def test_times_grow_even_if_the_clock_is_set_back(board):
 def test_two_clones_that_both_added(board, tmp_path):
     """Git's merge is a conflict; the second to push takes the other's log and adds again."""
     add(board, nonce="1")
-    mine, theirs = tmp_path / "mine", tmp_path / "theirs"
-    for clone, name in ((mine, "TQC"), (theirs, "SAC")):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for clone, name in ((first, "TQC"), (second, "SAC")):
         shutil.copytree(board.folder, clone / "board")
         add(Board(clone / "board"), name)
-    base, a, b = (path / "board.jsonl" for path in (board.folder, mine / "board", theirs / "board"))
+    base, a, b = (path / "board.jsonl" for path in (board.folder, first / "board", second / "board"))
     for how in ([], ["--union"]):  # a union would keep both, and break the chain
         merge = ["git", "merge-file", *how, "-p", str(a), str(base), str(b)]
         merged = subprocess.run(merge, capture_output=True).stdout
         with pytest.raises(BoardError, match=r"line \d+ is (no event|not what followed)"):
             parse(merged)
     shutil.copy(b, a)
-    mine = Board(mine / "board")
-    mine.add(fake_submissions.load(next(mine.folder.glob("submissions/*-tqc-*"))))
-    assert {e.name: e.state for e in mine.read().entries.values()} == {
+    first = Board(first / "board")
+    first.add(fake_submissions.load(next(first.folder.glob("submissions/*-tqc-*"))))
+    assert {e.name: e.state for e in first.read().entries.values()} == {
         "PPO": "verified", "SAC": "pending", "TQC": "pending",
     }  # fmt: skip
 

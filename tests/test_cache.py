@@ -42,7 +42,7 @@ def hits(key="some source", value=1.5):
 
 
 def files(place):
-    return [entry.path for entry in cache.entries(place)]
+    return [entry.path for entry in cache.cache_files(place)]
 
 
 def flipped(at):
@@ -89,7 +89,7 @@ def test_a_damaged_file_is_dropped_with_one_warning(place, how):
     for path in files(place):
         DAMAGE[how](path)
         assert cache.damage(path)
-    with pytest.warns(RuntimeWarning, match="damaged: .*compiled anew") as told:
+    with pytest.warns(RuntimeWarning, match="damaged: .*compiled again") as told:
         assert (hits(), hits("other source")) == (0, 0)
     assert len(told) == 1
     assert (hits(), hits("other source")) == (1, 1)
@@ -189,16 +189,16 @@ def test_a_full_disk(place):
 
 def test_its_size_is_bounded_and_what_is_used_stays(place, monkeypatch):
     hits("0")
-    size = cache.entries(place)[0].size
+    size = cache.cache_files(place)[0].size
     monkeypatch.setattr(cache, "LIMIT", 3 * size + size // 2)
     for name in "12":
         hits(name)
-    for entry in cache.entries(place):  # all a year old; using one makes it young
+    for entry in cache.cache_files(place):  # all a year old; using one makes it young
         os.utime(entry.path, (0, time.time() - 3e7))
     assert hits("0") == 1
     for name in "34":
         hits(name)
-    assert sum(entry.size for entry in cache.entries(place)) <= cache.LIMIT
+    assert sum(entry.size for entry in cache.cache_files(place)) <= cache.LIMIT
     assert [hits(name) for name in "0341"] == [1, 1, 1, 0]
     # Left-overs of a killed process count, and are removed like the rest.
     left = place / f"new-12345{cache._SUFFIX}"
@@ -220,7 +220,7 @@ def double(x):
 rng = random.Random(int(sys.argv[1]))
 for i in range(8):
     assert cache.jit(double, "some source")(1.5) == 3.0
-    for entry in cache.entries(cache.folder()):
+    for entry in cache.cache_files(cache.folder()):
         what = rng.randrange(4)
         try:
             if what == 0:

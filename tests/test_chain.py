@@ -16,7 +16,7 @@ from lag_envs.controllers.chain import loss, replan
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.mpc import MPC, without_kicks
 from lag_envs.controllers.tracking import Tracking, follow, recorded, search
-from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.tasks import chain, pivoted_bar
 
 # They share their formulas; each has its own programs, which compile for seconds.
@@ -69,7 +69,7 @@ def test_doing_nothing_earns_nothing(kind):
 @pytest.mark.parametrize(("kind", "fastest"), [(chain.SwingUp, 45.0), slow(chain.SwingUpTriple, 70.0)])
 def test_bars_whip_and_steps_are_divided(kind, fastest):
     """Random actions turn bars so fast that one series diverges; divided, a step equals its four quarters."""
-    played = record(Rollout(kind.id, make_controller(kind.id, "random"), range(300)))
+    played = record_rollout(Rollout(kind.id, make_controller(kind.id, "random"), range(300)))
     states, task = played.states.reshape(-1, played.states.shape[-1]), kind()
     rates = np.abs(states[:, 3::2]).max(axis=1)
     state = states[rates.argmax()]

@@ -136,7 +136,7 @@ def test_what_ships_is_what_the_command_makes_of_the_board(tmp_path):
 
 def test_too_small_a_room_is_said():
     with pytest.raises(UserError, match="at most 10 bytes"):
-        shipped.chosen([shipped.Candidate("A", 1.0, 90, "a", 0, "table")], 10)
+        shipped.chosen_candidates([shipped.Candidate("A", 1.0, 90, "a", 0, "table")], 10)
 
 
 def test_a_folder_without_a_board_is_refused(capsys, tmp_path):
@@ -149,7 +149,7 @@ def test_a_folder_without_a_board_is_refused(capsys, tmp_path):
 @pytest.mark.parametrize("env_id", covering(shipped.shipped()))
 def test_what_ships_does_better_than_nothing(env_id):
     env, task = gym.make(env_id), TASKS[env_id]()
-    agents = shipped.load(env_id), watch.load(env_id, task, "zero")[1]
+    agents = shipped.load(env_id), watch.load_agent(env_id, task, "zero")[1]
     played = [watch._episode(env, agent, 1, None, lambda env: False) for agent in agents]
     assert all(whole for _, whole, _ in played)
     assert score(env_id, played[0][0]) > score(env_id, played[1][0])
@@ -165,19 +165,19 @@ def test_watch_takes_agents_by_name_and_by_file(tmp_path):
     entries = [e for e in Board(board).read().entries.values() if e.env == task.id and e.name == "PPO"]
     folder = Board(board).submission(entries[-1].id)
     for name in (None, "ppo", "LQR", "zero", "random", str(folder)):
-        _, agent = watch.load(task.id, task, name)
+        _, agent = watch.load_agent(task.id, task, name)
         assert agent.predict(observation)[0].shape == (1, 1), name
-    assert watch.load(task.id, task, entries[-1].id, board)[0] == entries[-1].id
+    assert watch.load_agent(task.id, task, entries[-1].id, board)[0] == entries[-1].id
     for name, message in (
         ("pppo", "has no agent 'pppo', and there is no such file; did you mean PPO?"),
         (str(tmp_path), "is neither a model nor a folder with model.zip"),
         (str(board / "submissions" / "PivotedBar-v0-ppo-c1dc3900"), "an agent of PivotedBar-v0, not of Piv"),
     ):
         with pytest.raises(UserError, match=re.escape(message)):
-            watch.load(task.id, task, name)
+            watch.load_agent(task.id, task, name)
     (tmp_path / "broken.zip").write_bytes(b"PK")
     with pytest.raises(UserError, match="is not a model of Stable-Baselines3"):
-        watch.load(task.id, task, str(tmp_path / "broken.zip"))
+        watch.load_agent(task.id, task, str(tmp_path / "broken.zip"))
 
 
 def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
@@ -190,22 +190,22 @@ def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
     model.save(tmp_path / "model.zip")
     envs.save(str(tmp_path / "vecnormalize.pkl"))
     observation, task = np.ones(5, np.float32), TASKS[ID]()
-    _, alone = watch.load(ID, task, str(tmp_path / "model.zip"))
-    _, whole = watch.load(ID, task, str(tmp_path))
+    _, alone = watch.load_agent(ID, task, str(tmp_path / "model.zip"))
+    _, whole = watch.load_agent(ID, task, str(tmp_path))
     assert alone.predict(observation)[0] == model.predict(observation, deterministic=True)[0]
     seen = envs.normalize_obs(observation)
     assert whole.predict(observation)[0] == model.predict(seen, deterministic=True)[0]
     with pytest.raises(UserError, match=rf"observes \(5,\) numbers, {FREE} has \(3,\)"):
-        watch.load(FREE, TASKS[FREE](), str(tmp_path / "model.zip"))
+        watch.load_agent(FREE, TASKS[FREE](), str(tmp_path / "model.zip"))
     bins = SimpleNamespace(action_space=gym.spaces.Discrete(5), predict=lambda *_, **__: (np.array(4), None))
-    assert watch.Model(bins, None, gym.make(ID).action_space).predict(observation)[0] == np.float32(0.8)
+    assert watch.SB3Model(bins, None, gym.make(ID).action_space).predict(observation)[0] == np.float32(0.8)
 
 
 def test_watch_opens_a_window_until_it_is_closed(window, capsys, monkeypatch):
     assert cli.main(["watch", ID, "--seed", "1", "--steps", "3"]) == 0
     assert "PivotedBar-v0: PPO" in capsys.readouterr().out
     assert cli.main(["watch", BALL, "--steps", "3", "--arrows", "--trail", "1", "--readout"]) == 0
-    agent = watch.load(ID, TASKS[ID](), "zero")[1]
+    agent = watch.load_agent(ID, TASKS[ID](), "zero")[1]
     predict, seen = agent.predict, []
 
     def closing(*given, **named):
@@ -263,7 +263,7 @@ def test_sticks_become_actions():
 
     def action(env, *sticks, keys=()):
         rest = play.resting(env.unwrapped.task)
-        return play.action_of(env.action_space, keys.__contains__, rest, sticks)
+        return play.pressed_action(env.action_space, keys.__contains__, rest, sticks)
 
     # The second of the crane's controls goes from 0 to 20 N and rests at its lower end.
     assert action(crane, 0.5, 0.5).tolist() == [0.5, 0.0]
@@ -317,7 +317,7 @@ def elsewhere(tmp_path, monkeypatch):
             del sys.modules[name]
     for id in set(gym.registry) - before[1]:
         del gym.registry[id]
-    own_files.load.cache_clear()
+    own_files.load_module.cache_clear()
 
 
 @pytest.mark.parametrize("name", ["my_scene", "scene", "swing_up", "task", "_", "parameter"])

@@ -17,6 +17,7 @@ from lag_envs.evaluation.conditions import (
     often,
     on_board,
 )
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.tasks import TASKS
 
 
@@ -29,7 +30,7 @@ def test_conditions_make_environments(env_id):
     assert tasks[OFTEN].limit == 10.0 * tasks[NOMINAL].steps
     disturbed = [condition.name for condition in disturbances(env_id)]
     scene = TASKS[env_id]().scene
-    numbers = [name for name in scene._numbers() if 0.0 < getattr(scene, name) < math.inf]
+    numbers = [name for name in parameter_names(scene) if 0.0 < getattr(scene, name) < math.inf]
     for name in numbers:
         changed = getattr(tasks[f"{name} +20 %"].scene, name)
         assert changed == pytest.approx(1.2 * getattr(tasks[NOMINAL].scene, name))

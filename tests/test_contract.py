@@ -29,6 +29,7 @@ from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
 from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.derivation import code_of
 from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
@@ -404,8 +405,8 @@ def test_parameter_that_is_zero_leaves_no_code_and_another_value_gives_the_same(
     """In a denominator or a function it is inserted at once; elsewhere code leaves out its products."""
     damped = RotaryPendulum(damping=0.1)
     assert damped.mechanics.key == RotaryPendulum(damping=0.2, mass=3.0).mechanics.key
-    assert RotaryPendulum()._code(0.02) is not damped._code(0.02)
-    assert damped._code(0.02) is RotaryPendulum(damping=0.2, mass=3.0)._code(0.02)
+    assert code_of(RotaryPendulum(), 0.02) is not code_of(damped, 0.02)
+    assert code_of(damped, 0.02) is code_of(RotaryPendulum(damping=0.2, mass=3.0), 0.02)
 
     class Soft(cart(False)):
         width: float = parameter(0.5, "m", least=0.0)
@@ -582,8 +583,8 @@ def test_chain_of_one_bar_is_the_bar(damping):
         rtol=1e-13,
     )
     for call in ("energy", "forces", "power"):
-        mine, theirs = getattr(chain, call)(states, controls), getattr(bar, call)(states, controls)
-        for name, value in theirs.items():
+        mine, of_bar = getattr(chain, call)(states, controls), getattr(bar, call)(states, controls)
+        for name, value in of_bar.items():
             np.testing.assert_allclose(mine[name], value, rtol=1e-12, atol=1e-12)
 
 

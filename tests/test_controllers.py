@@ -26,6 +26,7 @@ from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
+from lag_envs.scenes.derivation import form_of
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.registration import make_task
@@ -111,7 +112,7 @@ def observations():
         goal = 0.0 if task.target_range is None else task.target_range * rng.uniform(-1.0, 1.0, n)
         read = ObservationDecoder(task)
         k = SimpleNamespace(**task.formulas.constants())
-        form, goals = task.scene._form, [goal] * task.formulas.targets
+        form, goals = form_of(task.scene), [goal] * task.formulas.targets
 
         def seen(states):
             rows = form.lift(states) if form else tuple(states.T)
@@ -153,7 +154,7 @@ def test_plans_are_kept_outside(observations):
     _, other = agent.predict(second)  # another episode in between
     follow, later = agent.predict(first, state)
     np.testing.assert_array_equal(follow, agent.predict(first, state)[0])
-    # New episodes are planned again, the others go on.
+    # New episodes are planned again, the others continue.
     _, mixed = agent.predict(np.stack([first[0], second[1]]), later, np.array([False, True]))
     assert mixed.step.tolist() == [3, 1]
     np.testing.assert_array_equal(mixed.actions[0], state.actions[0])

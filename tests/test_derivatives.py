@@ -12,7 +12,9 @@ from covering import covering, engine, slow
 from test_jacobian import exact_step
 
 from lag_envs.envs.model import Model
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks import TASKS
 
 
@@ -22,7 +24,7 @@ def seeded(name):
 
 def finite(scene):
     """Return the names of the parameters that are not infinite."""
-    return [name for name in scene._numbers() if math.isfinite(getattr(scene, name))]
+    return [name for name in parameter_names(scene) if math.isfinite(getattr(scene, name))]
 
 
 def directional(scene, state, control, dt, names, direction):
@@ -158,7 +160,7 @@ def exact_results(task, state, action, target, parameters):
     xp, f, scene = Exactly(), task.formulas, task.scene
     constants = f.constants() | {f"self_{name}": value for name, value in parameters.items()}
     k = SimpleNamespace(**{name: mpmath.mpf(value) for name, value in constants.items()})
-    angle = None if scene._form is None else scene._form.angle
+    angle = None if form_of(scene) is None else form_of(scene).angle
 
     def lifted(y):
         return [*y] if angle is None else [*y, mpmath.cos(y[angle]), mpmath.sin(y[angle])]
@@ -197,7 +199,7 @@ def starts(task, rng, n):
 
 def way(kind):
     """Return how a task's step is differentiated."""
-    found = "imperfect" if kind.imperfections else "closed form" if kind().scene._form else "series"
+    found = "imperfect" if kind.imperfections else "closed form" if form_of(kind().scene) else "series"
     return frozenset([found])
 
 

@@ -22,16 +22,18 @@ from lag_envs.envs.program import BLOCK
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import reference
 from lag_envs.leaderboard.standings import board_data
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report.docs import generated
 from lag_envs.report.environment_results import LARGEST_STEP
-from lag_envs.report.episodes import play, random_actions
-from lag_envs.report.reference import flow
+from lag_envs.report.episodes import endless_actions, record_episode
+from lag_envs.report.reference import exact_flow
 from lag_envs.report.report import SECTIONS
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, order_of
 from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, pivoted_bar
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
 from tools.docs.equations import symbol
@@ -62,7 +64,7 @@ def plain(text):
 
 
 def agrees(stated, value):
-    """Tell whether a stated number is the value, rounded to the printed digits."""
+    """Return whether a stated number is the value, rounded to the printed digits."""
     digits = len(stated.partition(".")[2])
     return abs(float(stated) - value) <= 0.5001 * 10.0**-digits + 1e-6 * abs(value)
 
@@ -199,7 +201,7 @@ def test_equations(env_id, page):
     """The equations hold for the scene's accelerations, and the formula with numbers is the acceleration."""
     scene = make(env_id).scene
     head, *latex = re.findall(r"application/x-tex\">(.*?)</annotation>", page)
-    free = scene._layout.free
+    free = layout_of(scene).free
     assert head.startswith(r"\mathcal{L} = ") and all(one.endswith("= 0") for one in latex[: len(free)])
     state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
     found = {
@@ -216,7 +218,7 @@ def test_equations(env_id, page):
         assert stated == pytest.approx(found[free[0]], rel=1e-4)
         return
     assert len(latex) == len(free)
-    letters = {as_python(symbol(type(scene), name)): getattr(scene, name) for name in scene._numbers()}
+    letters = {as_python(symbol(type(scene), name)): getattr(scene, name) for name in parameter_names(scene)}
     values |= letters | {f"{name}_ddot": value for name, value in found.items()}
     for one in latex:
         left = as_python(one.removesuffix("= 0"))
@@ -227,7 +229,7 @@ def test_equations(env_id, page):
 @pytest.mark.parametrize("env_id", covering(have("returns")))
 def test_known_returns_and_agents(env_id, page, board):
     found = sections(page)
-    known = measured(env_id)["measured"]
+    known = measured_entry(env_id)["measured"]
     stated = {row["Policy"]: row for row in table(found["Known Returns"])}
     assert float(stated["random actions"]["Return"].split(" ")[0]) == pytest.approx(
         known["random"]["mean"], rel=1e-3
@@ -253,7 +255,7 @@ def test_certified_speed(env_id, page):
     certified = task.certified_speed()
     order = scene.step_bound(task.centre, 0.0, task.dt).order
     if certified is None:  # a closed form, or a series that is certified when the step is known
-        assert stated is None and (not order or scene._form is None)
+        assert stated is None and (not order or form_of(scene) is None)
         return
     assert f"order {order}." in text
     assert stated[1] == f"{math.floor(10.0 * certified) / 10.0:.1f}"
@@ -265,7 +267,7 @@ def test_certified_speed(env_id, page):
     def bounds(speed):
         for u, rate in itertools.product(controls, (-fastest, 0.0, fastest)):
             state = [0.0] * len(scene.state_names)
-            state[scene._form.angle + 1] = speed
+            state[form_of(scene).angle + 1] = speed
             if fastest:
                 state[2] = rate
             yield scene.step_bound(state, u, task.dt)
@@ -275,7 +277,7 @@ def test_certified_speed(env_id, page):
     assert max(bound.substeps for bound in bounds(certified * (1.0 + 1e-9))) > 1
 
 
-@pytest.mark.parametrize("env_id", covering(i for i in PERFECT if TASKS[i]().scene._form))
+@pytest.mark.parametrize("env_id", covering(i for i in PERFECT if form_of(TASKS[i]().scene)))
 def test_measured_error(env_id):
     """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 
@@ -289,24 +291,24 @@ def test_measured_error(env_id):
     assert f"error is less than {limit} of the largest value that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
-    episode = play(env, random_actions(env, 3))
+    episode = record_episode(env, endless_actions(env, 3))
     sizes = np.maximum(1.0, np.abs(episode.states).max(axis=0))
     for i in np.linspace(0, len(episode.controls) - 1, 14).astype(int).tolist():
         before, control = episode.states[i], episode.controls[i]
         after = episode.states[i + 1]
         if env.task.draws:
             after = scene.simulate(before, [control], env.task.dt)[1]  # without a kick
-        exact = flow(scene, before, control, env.task.dt)
+        exact = exact_flow(scene, before, control, env.task.dt)
         errors = [abs(float(a - b)) / size for a, b, size in zip(exact, after, sizes, strict=True)]
         grown = np.abs(scene.jacobian(before, control, env.task.dt)[0]) * sizes / sizes[:, None]
         attempts = scene.step_bound(before, control, env.task.dt).substeps
-        times = 1.0 if scene._form else attempts * max(1.0, grown.sum(axis=1).max())
+        times = 1.0 if form_of(scene) else attempts * max(1.0, grown.sum(axis=1).max())
         assert max(errors) < LARGEST_STEP * times
 
 
 def scale(env_id):
     """Return the results of `python -m agents.scale`, by policy."""
-    return measured(env_id)["measured"]
+    return measured_entry(env_id)["measured"]
 
 
 @pytest.mark.parametrize("env_id", have("returns"))
@@ -368,7 +370,7 @@ def test_a_replay_becomes_a_moving_picture(tmp_path):
     states = [[0.0, 0.0, 0.1 * i, 0.5] for i in range(13)]
     replay = {"states": states, "actions": [[0.5]] * 12, "target": None}
     frames, seconds = pictures.frames(env_id, replay)
-    pictures.write(tmp_path / "a.webp", frames, seconds)
+    pictures.write_animation(tmp_path / "a.webp", frames, seconds)
     with Image.open(tmp_path / "a.webp") as picture:
         assert picture.n_frames == len(frames) == 5 and picture.width == pictures.CHOICES[0][0]
 
@@ -412,10 +414,12 @@ def test_generated_parts_are_as_generated():
     """Pages and README's tables are generated from the JSON files beside them, and from the records."""
     for path, text in generated(ROOT).items():
         assert path.read_text(encoding="utf-8") == text, (
-            f"{path.name}: `python -m lag_envs.report.docs` writes it anew"
+            f"{path.name}: `python -m lag_envs.report.docs` writes it again"
         )
     for path, text in from_records(ROOT).items():
-        assert path.read_text(encoding="utf-8") == text, f"{path.name}: `python -m tools.docs` writes it anew"
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name}: `python -m tools.docs` writes it again"
+        )
 
 
 def test_speeds():
@@ -448,16 +452,16 @@ def test_speeds():
 
 def test_numbers_in_the_prose():
     """Statements on pages about the code's own numbers are true."""
-    weight = make(pivoted_bar.SwingUpFree.id).scene._constants()["alpha"]
+    weight = motion_constants_of(make(pivoted_bar.SwingUpFree.id).scene)["alpha"]
     doubling = math.log(2.0) / math.sqrt(weight)
     bar, brake = PivotedBar(), CylinderInCylinder(control="damping")
-    assert brake._order(0.02) == bar._order(0.031)
+    assert order_of(brake, 0.02) == order_of(bar, 0.031)
     said = {
         "docs/accuracy.md": [f"doubles an error every {doubling:.2f} s", "more than a million substeps"],
         "docs/numerics.md": [
             f"more than {pendulum.MAX_SUBSTEPS:,} substeps",
             f"blocks of {BLOCK} environments",
-            f"order is {bar._order(0.03)}, and {bar._order(0.031)} for steps above 0.03 s and where",
+            f"order is {order_of(bar, 0.03)}, and {order_of(bar, 0.031)} for steps above 0.03 s and where",
         ],
     }
     assert pendulum.MAX_SUBSTEPS == 1_000_000

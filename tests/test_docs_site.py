@@ -14,6 +14,7 @@ from browsers import serious
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES
 from lag_envs.tasks import TASKS
 from tools.docs import equations
@@ -133,10 +134,10 @@ def test_links_lead_somewhere(site, pages):
 def test_what_is_bundled_is_noticed(site):
     """NOTICE.md covers each third-party script and style."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
-    ours = {"docs.css", "docs.js"}
+    own_files = {"docs.css", "docs.js"}
     for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
         place = path.relative_to(site)
-        if place.parts[0] in ("board", "search") or path.name in ours:
+        if place.parts[0] in ("board", "search") or path.name in own_files:
             continue
         assert place.parts[0] == "assets", place
     for name in ("Material for MkDocs", "iframe-worker", "lunr", "RxJS", "clipboard.js", "Icons"):
@@ -159,7 +160,7 @@ def test_formulas_are_whole(site):
 
 def test_symbols_are_those_of_the_docstrings():
     for kind in SCENES:
-        symbols = [equations.symbol(kind, name) for name in kind()._numbers()]
+        symbols = [equations.symbol(kind, name) for name in parameter_names(kind())]
         assert len(set(symbols)) == len(symbols), kind
         assert not any("mathrm" in symbol for symbol in symbols), kind
 

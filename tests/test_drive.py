@@ -19,8 +19,8 @@ from test_policies import OWN as LATER_TASKS
 from lag_envs import cli, replay
 from lag_envs.controllers import controllers
 from lag_envs.envs.unfused import Unfused
-from lag_envs.leaderboard.policies import Policy, architecture
-from lag_envs.leaderboard.site.build import build
+from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
+from lag_envs.leaderboard.site.build import write_page
 from lag_envs.leaderboard.site.driving import agent, script_of, sliders
 from lag_envs.tasks import TASKS, chain, cylinder_in_cylinder, incline, pendulum, pivoted_bar
 from tests import board_pages
@@ -80,7 +80,7 @@ def rollout(task, seed, actions, env=None):
 @pytest.fixture
 def alone(tmp_path, id):
     """A folder with the page of an environment, without agents."""
-    build(board_pages.data((id,), agents=()), tmp_path)
+    write_page(board_pages.data((id,), agents=()), tmp_path)
     return tmp_path
 
 
@@ -88,7 +88,7 @@ def alone(tmp_path, id):
 def bare(tmp_path_factory):
     """A folder with pages of environments, without agents, and the files that drive users' tasks."""
     folder = tmp_path_factory.mktemp("bare")
-    build(board_pages.data(BARE, agents=()), folder)
+    write_page(board_pages.data(BARE, agents=()), folder)
     for task in (*OWN, Six):
         (folder / "assets" / f"{task.id}.js").write_text(script_of(task))
     return folder
@@ -234,7 +234,7 @@ def link():
     keys, total, over = [], 0.0, False
     while not over:
         keys.append(((-64, 33, 64)[min(len(keys) // 9, 2)],))
-        _, reward, *ended = env.step(replay.action_of(keys[-1], task))
+        _, reward, *ended = env.step(replay.action_from_numbers(keys[-1], task))
         total, over = total + reward, any(ended)
     return replay.Drive(task.id, 77, replay.pack(keys), total, env.program.digest)
 
@@ -360,7 +360,7 @@ def owned(tmp_path_factory):
         for task in OWN:
             patch.setitem(TASKS, task.id, task)
         boards = [{"id": task.id, "rows": []} for task in OWN]
-        build({"protocol": 1, "made": "today", "environments": boards}, folder)
+        write_page({"protocol": 1, "made": "today", "environments": boards}, folder)
     return folder
 
 
@@ -519,7 +519,9 @@ POLICIES = [*policies(), *((f"{id}: {table}", id, table, None) for id, table in 
 
 def made(id, table, arrays):
     arrays = numbers(id, table) if arrays is None else arrays
-    return Policy(architecture(id, table), {name: np.asarray(x, np.float64) for name, x in arrays.items()})
+    return SubmittedPolicy(
+        architecture(id, table), {name: np.asarray(x, np.float64) for name, x in arrays.items()}
+    )
 
 
 def covering_architectures():
@@ -567,7 +569,7 @@ def test_agents_act_in_the_page_as_in_python(browsing, bare, monkeypatch, name, 
 @pytest.mark.parametrize("name", ["random", "energy shaping + LQR", "iLQR"])
 def test_others_run_in_python_only(name):
     table = {"architecture": "controller", "name": name}
-    assert agent(Policy(architecture("PivotedBar-v0", table), {})) is None
+    assert agent(SubmittedPolicy(architecture("PivotedBar-v0", table), {})) is None
 
 
 @pytest.fixture(scope="module")
@@ -580,7 +582,7 @@ def haunted(tmp_path_factory):
     for replay_ in recorded["replays"]:
         replay_["reset_seed"] = 2**61 + 3
     data["environments"][0]["drives"] = [{"name": "Ada", "link": "#seed=4", "return": 1.0, "score": 0.5}]
-    build(data, folder)
+    write_page(data, folder)
     return folder
 
 
@@ -616,8 +618,8 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
     ghost = id == cylinder_in_cylinder.Tilt.id
     if ghost:
         axes = {"axis_0": np.linspace(-1, 1, 9), "axis_1": np.linspace(-2, 2, 9), "table": np.ones((9, 9))}
-        data["environments"][0]["rows"][0]["agent"] = agent(Policy(architecture(id, table), axes))
-    build(data, tmp_path)
+        data["environments"][0]["rows"][0]["agent"] = agent(SubmittedPolicy(architecture(id, table), axes))
+    write_page(data, tmp_path)
     assert any(np.quantile(frames(drive(id, folder=tmp_path), ghost), 0.99) <= 8.0 for _ in range(3))
 
 

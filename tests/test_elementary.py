@@ -19,7 +19,7 @@ from lag_envs.stepping import elementary
 from lag_envs.stepping.compiling import compile_traced
 from lag_envs.stepping.elementary import LARGEST_ANGLE, ElementaryTrace
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.tracing import Trace, evaluate
+from lag_envs.stepping.tracing import Trace, evaluate_operations
 
 # For each formula its exact values and the largest error allowed [ulp].
 EXACT = {
@@ -95,7 +95,7 @@ def compiled(function, fused, width):
 def interpreted(function, fused, x):
     """Return the results with Python's floats, (n, results)."""
     operations, results = recorded(function, fused)
-    known = [evaluate(operations, {"x": value}) for value in x.tolist()]
+    known = [evaluate_operations(operations, {"x": value}) for value in x.tolist()]
     return np.array([[values[name] for name in results] for values in known])
 
 
@@ -294,7 +294,7 @@ def test_exact_operations():
         x = np.array([powers, numbers]).reshape(2, -1, width).transpose(1, 0, 2)
         values = lanes(operations, ["a", "b"], results, width)(x).transpose(1, 0, 2).reshape(3, -1)
         np.testing.assert_array_equal(values, expected)
-    python = [evaluate(operations, {"a": p, "b": x}) for p, x in zip(powers, numbers, strict=True)]
+    python = [evaluate_operations(operations, {"a": p, "b": x}) for p, x in zip(powers, numbers, strict=True)]
     np.testing.assert_array_equal([[known[r] for r in results] for known in python], expected.T)
 
 
@@ -312,7 +312,7 @@ def test_every_operation_on_vectors_and_on_floats(fused):
     values = rng.choice(
         [0.0, -0.0, 1.0, -2.5, 1e200, -1e300, 5e-324, math.inf, math.nan, *rng.normal(size=9)], (2, 400)
     )
-    python = [evaluate(operations, {"a": a, "b": b}) for a, b in values.T.tolist()]
+    python = [evaluate_operations(operations, {"a": a, "b": b}) for a, b in values.T.tolist()]
     python = np.array([[known[r] for r in results] for known in python])
     for width in (1, 4, 8):
         x = values.reshape(2, -1, width).transpose(1, 0, 2)
@@ -406,7 +406,7 @@ def test_operations_on_other_numbers():
     (x,) = trace.inputs("x")
     operations, (result,) = trace.operations([trace.sqrt(x * x + 1.0) / x], fused=False)
     with mpmath.workdps(40):
-        value = evaluate(operations, {"x": mpmath.mpf(2)}, {"sqrt": mpmath.sqrt})[result]
+        value = evaluate_operations(operations, {"x": mpmath.mpf(2)}, {"sqrt": mpmath.sqrt})[result]
         assert abs(value - mpmath.sqrt(5) / 2) < mpmath.mpf(10) ** -39
 
 
@@ -424,7 +424,7 @@ def test_trace_of_plain_arithmetic():
     ]
     operations, results = trace.operations(functions, fused=False)
     assert not {operation.op for operation in operations} & {"sin", "cos", "exp", "log"}
-    known = evaluate(operations, {"x": 0.7})
+    known = evaluate_operations(operations, {"x": 0.7})
     exact = [f(0.7) for f in (math.sin, math.cos, math.tan, math.exp, math.log, math.atan, math.tanh)]
     np.testing.assert_allclose([known[result] for result in results], exact, rtol=5e-16)
     # Nothing is recorded for constants, and known zeros stay zero.
@@ -435,5 +435,5 @@ def test_trace_of_plain_arithmetic():
         math.pi / 4,
     )
     operations, results = trace.operations([trace.sin(trace.zero()), trace.cos(trace.zero())])
-    known = evaluate(operations, {})
+    known = evaluate_operations(operations, {})
     assert [known.get(result, result) for result in results] == [0.0, 1.0]

@@ -724,10 +724,10 @@ def test_making_again_derives_nothing(env_id, monkeypatch):
     others = {name: 1.1 * getattr(scene, name) for name in ("mass", "gravity") if hasattr(scene, name)}
 
     def refuse(*arguments):
-        raise AssertionError("derived anew")
+        raise AssertionError("derived again")
 
     monkeypatch.setattr("lag_envs.mechanics.motion.derive_motion", refuse)
-    monkeypatch.setattr("lag_envs.mechanics.recording.record", refuse)
+    monkeypatch.setattr("lag_envs.mechanics.recording.record_scene", refuse)
     monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._names", refuse)
     make(env_id, **others)
 

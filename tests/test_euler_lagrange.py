@@ -13,17 +13,18 @@ from covering import slow
 
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.recording import control, parameter
+from lag_envs.mechanics.recording import control, parameter, parameter_names
 from lag_envs.scenes import symbolic
 from lag_envs.scenes.acrobot import Acrobot
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
 from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.derivation import form_of
 from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
-from lag_envs.stepping.general import code_of
+from lag_envs.stepping.general import series_code_of
 
 PACKAGE = [
     (PivotedBar, {}),
@@ -66,7 +67,7 @@ class Lagrange:
     def __init__(self, scene):
         self.scene, self.prescribed = scene, tuple(scene.prescribed)
         self.coordinates = (*scene.coordinates, *self.prescribed)
-        self.parameters = tuple(scene._numbers())
+        self.parameters = tuple(parameter_names(scene))
         of = {name: sympy.Function(name, real=True)(symbolic.t) for name in self.coordinates}
         q, v, self.a = ({name: sympy.Symbol(f"{k}_{name}") for name in self.coordinates} for k in "qva")
         u = {name: sympy.Symbol(f"u_{name}") for name in scene.control_names}
@@ -184,10 +185,10 @@ def test_energy_changes_by_what_power_says(case):
 
 def rate(scene, states, controls):
     """Return d(state)/dt by solving for accelerations; that of w by differences along the motion."""
-    from lag_envs.mechanics.evaluation import Numeric, Point
+    from lag_envs.mechanics.evaluation import MotionPoint, Numeric
 
     columns = [np.moveaxis(a, -1, 0) for a in (states, controls)]
-    point = Point(scene.mechanics, scene._symbols(), *columns, Numeric)
+    point = MotionPoint(scene.mechanics, scene._symbols(), *columns, Numeric)
     return np.stack([np.broadcast_to(r, states.shape[:-1]) for r in point.rates()], axis=-1)
 
 
@@ -289,7 +290,7 @@ FORMS = {
 def test_normal_form_is_the_derived_equation(case):
     """The exact flows step Lagrange's equation, and so does the general series."""
     scene = complete(case)
-    form, mechanics = scene._form, scene.mechanics
+    form, mechanics = form_of(scene), scene.mechanics
     key = "-".join([type(scene).__name__, *(str(v) for v in case[1].values() if v is not None)])
     assert (form and form.kind.__name__) == FORMS.get(key)
     if form is None:
@@ -331,14 +332,14 @@ def test_normal_form_is_the_derived_equation(case):
 def test_exact_flow_and_general_series_agree(case):
     """Each is the other's oracle, over steps in which the controls change."""
     scene = complete(case)
-    if scene._form is None:
+    if form_of(scene) is None:
         return
     generator = np.random.default_rng(7)
-    code, numbers = code_of(scene)
+    code, numbers = series_code_of(scene)
     for dt in (0.005, 0.02, 0.05):
         state = generator.uniform(-2.0, 2.0, len(scene.state_names))
         given = generator.uniform(0.0, 2.0, (40, len(scene.control_names)))
-        ours = scene.simulate(state, given, dt)
-        theirs = ours.copy()
-        assert code.simulation(theirs, given, dt, 20.0, *numbers) == 0
-        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-11 * np.abs(ours).max())
+        by_flow = scene.simulate(state, given, dt)
+        by_series = by_flow.copy()
+        assert code.simulation(by_series, given, dt, 20.0, *numbers) == 0
+        np.testing.assert_allclose(by_flow, by_series, rtol=0.0, atol=1e-11 * np.abs(by_flow).max())

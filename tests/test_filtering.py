@@ -53,10 +53,10 @@ def test_an_episode_that_begins_is_believed_anew():
     first, second = rng.normal(0.0, NOISE, (2, 3, 5)).astype(np.float32)
     _, known = agent.predict(first)
     _, known = agent.predict(second, known, np.array([False, True, False]))
-    _, anew = agent.predict(second)
+    _, again = agent.predict(second)
     _, single = agent.predict(second[1])
-    assert (known.state[1] == anew.state[1]).all() and (known.state[0] != anew.state[0]).any()
-    assert np.abs(single.state[0] - anew.state[1]).max() <= 1e-15
+    assert (known.state[1] == again.state[1]).all() and (known.state[0] != again.state[0]).any()
+    assert np.abs(single.state[0] - again.state[1]).max() <= 1e-15
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def noisy(states, sizes, seed):
 
 
 def agrees(found, truth, times=4.0):
-    """Tell whether estimates are within so many standard errors of the truth."""
+    """Return whether estimates are within this many standard errors of the truth."""
     errors = [abs(found.estimates[n] - truth[n]) / found.errors[n] for n in found.estimates]
     assert max(errors) < times, errors
     return True

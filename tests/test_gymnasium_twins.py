@@ -8,6 +8,7 @@ import pytest
 from rollouts import make
 
 from lag_envs.controllers import make_controller
+from lag_envs.mechanics.recording import parameter_names, parameter_values
 from lag_envs.report.gymnasium_peers import PEERS
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.cart_pole import CartPoleExact
@@ -23,25 +24,23 @@ def test_all_three_are_there():
 
 @each_pair
 def test_spaces_and_length_are_gymnasiums(env_id, peer_id):
-    ours, theirs = gym.make(env_id), gym.make(peer_id)
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    assert ours.spec.max_episode_steps == theirs.spec.max_episode_steps
-    assert ours.unwrapped.task.dt == PEERS[peer_id].step(theirs.unwrapped)
+    twin, original = gym.make(env_id), gym.make(peer_id)
+    assert twin.observation_space == original.observation_space
+    assert twin.action_space == original.action_space
+    assert twin.spec.max_episode_steps == original.spec.max_episode_steps
+    assert twin.unwrapped.task.dt == PEERS[peer_id].step(original.unwrapped)
 
 
 @each_pair
 def test_scene_and_starts_are_gymnasiums(env_id, peer_id):
-    task, theirs = TASKS[env_id](), gym.make(peer_id).unwrapped
-    scene = PEERS[peer_id].scene(theirs)
-    assert {name: getattr(scene, name) for name in scene._numbers()} == {
-        name: getattr(task.scene, name) for name in scene._numbers()
-    }
+    task, original = TASKS[env_id](), gym.make(peer_id).unwrapped
+    scene = PEERS[peer_id].scene(original)
+    assert parameter_values(scene) == {name: getattr(task.scene, name) for name in parameter_names(scene)}
     order = list(PEERS[peer_id].order)
     starts = []
     for seed in range(300):
-        theirs.reset(seed=seed)
-        starts.append(np.array(theirs.state)[order])
+        original.reset(seed=seed)
+        starts.append(np.array(original.state)[order])
     far = np.abs(np.array(starts) - task.centre) / np.array(task.half_widths)
     assert (far <= 1.0 + 1e-6).all() and (far.max(axis=0) > 0.98).all()
 
@@ -49,23 +48,23 @@ def test_scene_and_starts_are_gymnasiums(env_id, peer_id):
 @each_pair
 def test_steps_pay_and_end_as_gymnasiums(env_id, peer_id):
     """From the same states with the same actions: reward and ending, and roughly the motion."""
-    ours, theirs = make(env_id), gym.make(peer_id, disable_env_checker=True).unwrapped
+    twin, original = make(env_id), gym.make(peer_id, disable_env_checker=True).unwrapped
     peer, rng = PEERS[peer_id], np.random.default_rng(0)
-    order, half = list(peer.order), np.array(ours.task.half_widths)
+    order, half = list(peer.order), np.array(twin.task.half_widths)
     ends = 0
     for _ in range(200):
-        state = ours.task.centre + rng.uniform(-1.0, 1.0, len(half)) * np.minimum(half * 30.0, 3.0)
+        state = twin.task.centre + rng.uniform(-1.0, 1.0, len(half)) * np.minimum(half * 30.0, 3.0)
         if peer_id == "CartPole-v1":  # near enough to the limits to pass them now and then
             state = rng.uniform(-1.0, 1.0, 4) * [2.4, 2.0, 0.209, 3.0]
-        ours.reset(seed=0, options={"state": state})
-        theirs.reset(seed=0)
-        theirs.state = state[np.argsort(order)]
-        action = ours.action_space.sample()
-        _, reward, terminated, _, _ = ours.step(action)
-        _, their_reward, their_end, _, _ = theirs.step(action)
-        assert ours.control == pytest.approx(peer.control(theirs, action), abs=1e-7)
-        moved, off = np.abs(ours.state - state), ours.state - np.array(theirs.state)[order]
-        wraps = [i for i, unit in enumerate(ours.scene.state_units) if unit == "rad"]
+        twin.reset(seed=0, options={"state": state})
+        original.reset(seed=0)
+        original.state = state[np.argsort(order)]
+        action = twin.action_space.sample()
+        _, reward, terminated, _, _ = twin.step(action)
+        _, their_reward, their_end, _, _ = original.step(action)
+        assert twin.control == pytest.approx(peer.control(original, action), abs=1e-7)
+        moved, off = np.abs(twin.state - state), twin.state - np.array(original.state)[order]
+        wraps = [i for i, unit in enumerate(twin.scene.state_units) if unit == "rad"]
         off[wraps] -= 2.0 * np.pi * np.rint(off[wraps] / (2.0 * np.pi))
         assert np.abs(off).max() < 0.5 * max(moved.max(), 0.1)
         if terminated == their_end:
@@ -83,9 +82,9 @@ def test_one_policy_in_both(env_id, peer_id, capsys):
         print()
         for name, returns in found.items():
             print(f"{name:20} {TASKS[env_id].reference:24} {returns.mean():8.2f} ± {error(returns):.2f}")
-    theirs, ours = found.values()
-    assert abs(theirs.mean() - ours.mean()) < 4.0 * np.hypot(error(theirs), error(ours)) + 1e-9
-    assert min(theirs.mean(), ours.mean()) > {"CartPole-v1": 499.0, "Pendulum-v1": -250.0}.get(
+    original, twin = found.values()
+    assert abs(original.mean() - twin.mean()) < 4.0 * np.hypot(error(original), error(twin)) + 1e-9
+    assert min(original.mean(), twin.mean()) > {"CartPole-v1": 499.0, "Pendulum-v1": -250.0}.get(
         peer_id, -120.0
     )
 
@@ -113,8 +112,8 @@ def test_a_policy_trained_there_runs_here(capsys):
 @each_pair
 def test_energy_is_kept_here_and_not_there(env_id, peer_id):
     found = energy.paths(env_id)
-    (_, theirs), (_, ours) = found[peer_id], found[env_id]
-    assert np.ptp(ours) < 1e-9 * np.abs(ours).max() < 1e-2 * np.ptp(theirs)
+    (_, original), (_, twin) = found[peer_id], found[env_id]
+    assert np.ptp(twin) < 1e-9 * np.abs(twin).max() < 1e-2 * np.ptp(original)
 
 
 def test_only_the_observed_speed_is_clipped():

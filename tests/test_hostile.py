@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rollouts import IDS, actions, make, trace
 
-from lag_envs.envs.single import check_seed, key_of
+from lag_envs.envs.single import check_seed, seed_key
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
@@ -191,8 +191,8 @@ def test_seeds_of_numpy(kind):
 @settings(max_examples=200, deadline=None)
 @given(st.integers(0, 2**64 - 1), st.integers(1, 2**70))
 def test_every_bit_of_a_seed_counts(seed, more):
-    assert key_of(check_seed("seed", seed)) == seed
-    assert key_of(seed) != key_of(seed + more * 2**64)
+    assert seed_key(check_seed("seed", seed)) == seed
+    assert seed_key(seed) != seed_key(seed + more * 2**64)
 
 
 def test_seeds_beyond_64_bits_in_a_batch():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from covering import covering
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES, Scene, html, parameter
 from lag_envs.tasks import incline
 
@@ -41,7 +42,7 @@ def test_scenes_show_parameters_and_equations(kind):
     scene = kind()
     shown = Checked(scene._repr_html_())
     assert "math" in shown.tags and "script" not in shown.tags
-    for name in (*scene.state_names, *scene.control_names, *scene._numbers()):
+    for name in (*scene.state_names, *scene.control_names, *parameter_names(scene)):
         assert name in shown.text, name
     assert "mover" in shown.tags  # rates have dots
 
@@ -97,7 +98,7 @@ def test_environments_show_picture_and_spaces(env_id):
     shown = Checked(env._repr_html_())
     assert np.array_equal(env.state, state) and env._viewer is None and env._repr_html_() != before
     assert "img" in shown.tags and env_id in shown.text and str(env.action_space) in shown.text
-    for name in (*env.task.observation, *env.scene.control_names, *env.scene._numbers()):
+    for name in (*env.task.observation, *env.scene.control_names, *parameter_names(env.scene)):
         assert name in shown.text
 
 

@@ -22,6 +22,8 @@ from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.leaderboard.site import driving
 from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import parameter_names
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks import TASKS, pivoted_bar
 from lag_envs.tasks.imperfections import KEYWORDS, LARGEST_NORMAL, MARGIN
@@ -98,7 +100,7 @@ def test_every_environment(env_id):
     task = make_task(env_id)
     names, drawn = (
         task.observation,
-        next(n for n in task.scene._numbers() if 0.0 < getattr(task.scene, n) < 1e9),
+        next(n for n in parameter_names(task.scene) if 0.0 < getattr(task.scene, n) < 1e9),
     )
     keywords = ALL | {
         "observation_noise": {names[0]: 0.1, names[-1]: 0.2},
@@ -278,7 +280,7 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
         for t, end in zip(switches, [*switches[1:], (n + 1) * dt], strict=True):
             wanted = [u for when, u in arrivals if when <= t + 1e-12][-1]
             numbers = SimpleNamespace(**k | {"dt": end - t})
-            (control,) = formulas.guarded(np, [wanted], task.scene._form.lift(state), numbers)
+            (control,) = formulas.guarded(np, [wanted], form_of(task.scene).lift(state), numbers)
             pieces.append((t, state, control))
             state = task.scene.simulate(state, [control], end - t)[-1]
             mean += control * (end - t) / dt

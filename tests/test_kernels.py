@@ -84,30 +84,30 @@ def test_so_it_has_on_users_tasks(kind):
 def test_episodes_are_those_of_the_environments(kind, mode):
     """Over ends and starts, in each mode, to rounding: the environments' own step is fused."""
     n, options = 6, {"max_episode_steps": 15, "autoreset_mode": mode}
-    ours, theirs = on_processor(kind, n, **options), LagrangianVectorEnv(kind, n, **options)
-    first, (other, _) = ours.reset(seed=11), theirs.reset(seed=11)
+    on_kernel, batch = on_processor(kind, n, **options), LagrangianVectorEnv(kind, n, **options)
+    first, (other, _) = on_kernel.reset(seed=11), batch.reset(seed=11)
     assert np.allclose(first, other, rtol=1e-6, atol=1e-7)
     rng, ends = np.random.default_rng(0), 0
     for _ in range(60):
-        theirs.action_space.seed(int(rng.integers(2**31)))
-        given = theirs.action_space.sample()
-        found = ours.step(actions_of(ours.task, given))
-        expected = theirs.step(given)
+        batch.action_space.seed(int(rng.integers(2**31)))
+        given = batch.action_space.sample()
+        found = on_kernel.step(actions_of(on_kernel.task, given))
+        expected = batch.step(given)
         over = expected[2] | expected[3]
         ends += over.sum()
         assert np.allclose(found[0], expected[0], rtol=1e-5, atol=1e-6)
         assert np.allclose(found[1], expected[1], rtol=1e-9, atol=1e-9)
         assert np.array_equal(found[2], expected[2]) and np.array_equal(found[3], expected[3])
-        assert np.allclose(ours.state, theirs.state, rtol=1e-9, atol=1e-9)
+        assert np.allclose(on_kernel.state, batch.state, rtol=1e-9, atol=1e-9)
         if mode == "SameStep" and over.any():
             assert np.array_equal(found[4]["_final_obs"], over)
             last = np.stack(expected[4]["final_obs"][over])
             assert np.allclose(found[4]["final_obs"][over], last, rtol=1e-5, atol=1e-6)
         if mode == "Disabled" and over.any():
             with pytest.raises(ResetNeeded, match=r"reset their environments with options\['reset_mask'\]"):
-                ours.step(actions_of(ours.task, given))
-            again = ours.reset(options={"reset_mask": torch.from_numpy(over)})
-            assert np.allclose(again, theirs.reset(options={"reset_mask": over})[0], rtol=1e-5, atol=1e-6)
+                on_kernel.step(actions_of(on_kernel.task, given))
+            again = on_kernel.reset(options={"reset_mask": torch.from_numpy(over)})
+            assert np.allclose(again, batch.reset(options={"reset_mask": over})[0], rtol=1e-5, atol=1e-6)
     assert ends > 2 * n
 
 
@@ -149,7 +149,7 @@ def test_single_precision_is_the_step_to_its_rounding(id):
 
 
 def test_what_cannot_be_stepped_is_cut_off():
-    """The state is kept, others go on, and the next episode begins as after any other end."""
+    """The state is kept, others continue, and the next episode begins as after any other end."""
     envs = on_processor(FREE, 4, damping=0.0)
     envs.reset(seed=1)
     envs.rows[1, 1] = 1e9  # too fast for any number of substeps

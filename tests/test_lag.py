@@ -25,14 +25,17 @@ from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, TwoLinkArm
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.checks import SMALLEST_LAG
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.stepping import driver, general
+from lag_envs.stepping.certificate import Certificate
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.driver import compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace, fading
-from lag_envs.stepping.lag import LaggedStepper
-from lag_envs.stepping.machine import Layout
-from lag_envs.stepping.series import REACH, Certificate, Plain, Series
-from lag_envs.stepping.tracing import evaluate
+from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
+from lag_envs.stepping.machine import LaneLayout
+from lag_envs.stepping.series import REACH, Series
+from lag_envs.stepping.target import Plain
+from lag_envs.stepping.tracing import evaluate_operations
 
 #: Error of a control step, relative to the entry or to 1.
 LARGEST_ERROR = 2e-13
@@ -171,9 +174,9 @@ class Case(NamedTuple):
 
 
 def code_of(scene, fused=True):
-    constants = scene._constants(lagged=True)
+    constants = motion_constants_of(scene, lagged=True)
     absent = frozenset(name for name, value in constants.items() if value == 0.0)
-    code = scene._lagged.code(absent, fused)
+    code = lagged_stepper(scene.mechanics).code(absent, fused)
     return code, [constants[name.removeprefix("k_")] for name in code.constants]
 
 
@@ -264,7 +267,7 @@ def test_fading_in_every_range():
     generator = np.random.default_rng(1)
     with mpmath.workdps(40):
         for x in [0.0, 5e-324, 1e-9, 0.999999, 1.0, 1e3, 1e300, *10.0 ** generator.uniform(-12, 3, 200)]:
-            known = evaluate(operations, {"x": float(x)})
+            known = evaluate_operations(operations, {"x": float(x)})
             exact = mpmath.mpf(float(x))
             once = -mpmath.expm1(-exact) / exact if x else mpmath.mpf(1)
             # 1 - φ₁ cancels for small x
@@ -300,7 +303,7 @@ def tails(case, lags, h, order):
     numbers |= {f"to_{x}": command for x, command in zip(names, case.command, strict=True)}
     oracle = oracle_of(case.twin(**numbers))
     found = oracle.coefficients(case.there(case.state, *case.applied), [], h, order + 20, 45)
-    free = case.scene._layout.free
+    free = layout_of(case.scene).free
     with mpmath.workdps(40):
         return [
             float(sum(abs(c) for c in of[name][order + more :]))
@@ -363,9 +366,9 @@ def test_unfused_bits_are_those_of_plain_numbers(monkeypatch):
 def test_lanes_of_a_block_have_the_bits_of_a_single_one():
     case, generator, dt, order = CASES["cart"], np.random.default_rng(3), 0.02, 16
     code, numbers = code_of(case.scene)
-    layout, n = Layout(code.record), code.record.size
+    layout, n = LaneLayout(code.record), code.record.size
     stepper = LaggedStepper(case.scene.mechanics)
-    constants = case.scene._constants(lagged=True)
+    constants = motion_constants_of(case.scene, lagged=True)
     advance, xp = code.compile(), types.SimpleNamespace(where=lambda c, a, b: a if c else b)
     memory, alone = np.zeros((2 * layout.bounds + 1, BLOCK)), []
     for lane in range(30):
@@ -488,7 +491,7 @@ def test_environment_against_simulate(late):
         for h, wanted in ((late, sent), (dt - late, 5.0 * float(action[0]))):
             if h > 0.0:
                 k = types.SimpleNamespace(**numbers | {"dt": h})
-                (command,) = task.formulas.guarded(np, [wanted], scene._form.lift(state), k)
+                (command,) = task.formulas.guarded(np, [wanted], form_of(scene).lift(state), k)
                 state = scene.simulate(state, [command], h, lag=lag, applied=applied)[1]
                 applied, part = behind(applied, command, lag, h)
                 mean += part * h / dt

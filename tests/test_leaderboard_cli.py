@@ -218,7 +218,7 @@ def test_serve(run):
 def test_generated_parts_are_as_generated():
     for path, text in docs.generated(ROOT).items():
         assert path.read_text(encoding="utf-8") == text, (
-            f"{path.name}: `python -m lag_envs.leaderboard.docs` writes it anew"
+            f"{path.name}: `python -m lag_envs.leaderboard.docs` writes it again"
         )
 
 

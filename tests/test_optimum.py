@@ -19,13 +19,13 @@ from rollouts import one_by_one
 from scipy.optimize import brentq, minimize_scalar
 
 from agents import optimum
-from agents.optimum import IMAGES, RESULTS, Optimal, Solution, extrapolated, grid, played, solvable
+from agents.optimum import IMAGES, RESULTS, GreedyPolicy, Solution, extrapolated, grid, played, solvable
 from agents.run import fresh_seeds
-from agents.value_iteration import PROGRESS, VALUES, CacheError, Grid, ValueIteration, stretched
+from agents.value_iteration import PROGRESS, VALUES, CacheError, DynamicProgramme, Grid, stretched
 from lag_envs.controllers import make_controller, optimal_return
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
-from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.incline import Brake
@@ -107,7 +107,7 @@ def test_linear_quadratic_value():
     exact, found = -((points @ p) * points).sum(axis=1), []
     for n in (51, 101):
         axis = np.linspace(-1.0, 1.0, n)
-        problem = ValueIteration(Grid((axis, axis), (None, None)), np.linspace(-2, 2, 81), step, steps)
+        problem = DynamicProgramme(Grid((axis, axis), (None, None)), np.linspace(-2, 2, 81), step, steps)
         values = problem.solve(quiet=True)
         found.append(problem.grid.interpolate(values[0], points))
     # Between nodes a concave function lies above its interpolation, by less the finer the grid is.
@@ -127,7 +127,7 @@ def test_double_integrator_in_least_time():
         return ends, np.full(len(points), -dt), (np.abs(ends) < ball).all(axis=1)
 
     axes = tuple(stretched(-2.0, 0.0, 2.0, 160, 0.3) for _ in range(2))
-    problem = ValueIteration(Grid(axes, (None, None)), [-1.0, 0.0, 1.0], step, 90)
+    problem = DynamicProgramme(Grid(axes, (None, None)), [-1.0, 0.0, 1.0], step, 90)
     values = problem.solve(quiet=True)
     points = np.array([[1.0, 0.0], [-1.0, 0.0], [0.5, 0.5], [-0.5, -0.5]])
     x, v = (points * np.sign(points[:, :1])).T
@@ -151,7 +151,7 @@ def test_expectation_over_kicks():
         push = np.array([0.2, 0.0])
         return np.stack([points, points + push, points - push]), np.array([0.8, 0.1, 0.1])
 
-    problem = ValueIteration(Grid((axis, axis), (None, None)), [0.0], step, 5, kick)
+    problem = DynamicProgramme(Grid((axis, axis), (None, None)), [0.0], step, 5, kick)
     values = problem.solve(quiet=True)
     exact = 5 * 0.5**2 + (1 + 2 + 3 + 4) * 0.2 * 0.2**2
     assert problem.grid.interpolate(values[0], np.array([[0.5, 0.0]]))[0] == pytest.approx(exact, rel=1e-5)
@@ -188,7 +188,7 @@ def small():
             return ends, -(points**2).sum(axis=1), np.zeros(len(points), bool)
 
         axis = np.linspace(-1.0, 1.0, 21)
-        return ValueIteration(
+        return DynamicProgramme(
             Grid((axis, axis), (None, None)), [-1.0, 0.0, 1.0], step, steps, None, parameters
         )
 
@@ -259,7 +259,7 @@ def test_full_disk_is_an_error(small, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def brake():
-    return Optimal(incline.Brake.id, level=2.0, folder=None)
+    return GreedyPolicy(incline.Brake.id, level=2.0, folder=None)
 
 
 def test_brake_in_a_few_seconds(brake):
@@ -285,7 +285,7 @@ def test_agent_counts_the_steps_of_each_episode(brake):
 def test_agent_is_there_for_what_is_solved():
     able = f"no policy for 'PivotedBar-v0', only for {pivoted_bar.SwingUpFree.id}"
     with pytest.raises(ValueError, match=able):
-        Optimal("PivotedBar-v0")
+        GreedyPolicy("PivotedBar-v0")
 
 
 @pytest.mark.parametrize("env_id", played())
@@ -383,8 +383,8 @@ def test_killed_command_goes_on(tmp_path, number):
 
 @pytest.mark.slow
 def test_bar_is_up_in_two_seconds():
-    agent = Optimal(pivoted_bar.SwingUpFree.id, level=2.0, folder=None)
-    played = record(Rollout(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(1)))
+    agent = GreedyPolicy(pivoted_bar.SwingUpFree.id, level=2.0, folder=None)
+    played = record_rollout(Rollout(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(1)))
     assert 1.5 < played.settled()[0] < 2.5  # up for good
     assert play(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(100)).mean() > 419.5
 
@@ -409,7 +409,7 @@ def test_committed_results_are_consistent(file):
         list(grid(problem, level, 0.0).shape) for level in problem.levels
     ]
     # The caches' names depend on nodes, step and reward: none is out of date.
-    assert result["parameters"] == pytest.approx(optimum.parameters(TASKS[source](**problem.options)))
+    assert result["parameters"] == pytest.approx(optimum.scene_numbers(TASKS[source](**problem.options)))
     assert problem.actions == result["actions"] and list(problem.targets) == result["targets"]
     if result["lower"] is not None:
         low, high = result["lower"]["interval"]

@@ -13,7 +13,7 @@ from lag_envs.report import formulas, reference
 from lag_envs.report import oracle as oracles
 from lag_envs.report.bound import driven
 from lag_envs.report.closed_forms import elliptic, linear
-from lag_envs.report.formulas import Formulas
+from lag_envs.report.formulas import OperationList
 from lag_envs.report.oracle import Oracle, Unresolved, oracle_of
 from lag_envs.scenes import Scene, parameter
 from lag_envs.stepping.pendulum import Coefficients
@@ -86,9 +86,9 @@ def test_what_goes_far_is_by_the_closed_form(track, monkeypatch):
     state = [*start, 2.0, 3.0]
     exact = oracle_of(bar).flow(state, 4.0, 1.5)
     monkeypatch.setattr(Oracle, "once", None)  # not called
-    assert distance(reference.flow(bar, state, 4.0, 1.5), exact) < 1e-29
+    assert distance(reference.exact_flow(bar, state, 4.0, 1.5), exact) < 1e-29
     with pytest.raises(TypeError):
-        reference.flow(scenes.PivotedBar(track=track, damping=1e-9), state, 4.0, 1.5)
+        reference.exact_flow(scenes.PivotedBar(track=track, damping=1e-9), state, 4.0, 1.5)
 
 
 @pytest.mark.parametrize("decay", [1e-9, 1, 30, 2e3])
@@ -380,7 +380,7 @@ def test_a_motion_to_the_edge_of_one_is_resolved():
 def test_a_power_that_it_does_not_know_is_named():
     x = sympy.Symbol("x")
     with pytest.raises(ValueError, match=r"the power x\*\*\(1/3\) is neither whole nor a half"):
-        Formulas([x ** sympy.Rational(1, 3)], [x], [])
+        OperationList([x ** sympy.Rational(1, 3)], [x], [])
 
 
 def test_a_state_of_another_length_is_refused():
@@ -392,7 +392,7 @@ def test_a_state_of_another_length_is_refused():
 
 
 def test_it_shares_no_code_with_what_it_checks():
-    """Neither equations nor stepping: it imports SymPy's view of a scene and nothing else of ours."""
+    """Neither equations nor stepping: it imports SymPy's view of a scene and nothing else of the package."""
     import ast
     from pathlib import Path
 
@@ -405,8 +405,8 @@ def test_it_shares_no_code_with_what_it_checks():
         for name in node.names
     ]
     assert {name for name in imports if name.startswith("lag_envs")} == {
-        "lag_envs.scenes.symbolic", "lag_envs.report.formulas.Formulas", "lag_envs.report.formulas.Series",
-        "lag_envs.scenes.base.Scene",
+        "lag_envs.scenes.symbolic", "lag_envs.report.formulas.OperationList",
+        "lag_envs.report.formulas.FormulaSeries", "lag_envs.scenes.base.Scene",
     }  # fmt: skip
 
 
@@ -468,9 +468,9 @@ def test_remembered(tmp_path, monkeypatch):
     monkeypatch.setattr(reference, "store", tmp_path)
     first = reference.remembered(*problem)
     assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(reference, "flow", None)  # not called again
+    monkeypatch.setattr(reference, "exact_flow", None)  # not called again
     assert distance(reference.remembered(*problem), first) < 1e-38
-    assert reference.errors([float(x) for x in first], first) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert reference.differences([float(x) for x in first], first) == pytest.approx([0.0, 0.0], abs=1e-15)
     with pytest.raises(TypeError):
         reference.remembered(*problem[:3], 0.03)
 

@@ -44,12 +44,12 @@ def test_an_order_out_of_range_changes_nothing(order):
 def test_closed_forms_have_none():
     assert LagrangianVectorEnv(PENDULUM, 2).order is None
     with pytest.raises(UserError, match="closed form"):
-        orders.measure(PENDULUM)
+        orders.measure_orders(PENDULUM)
 
 
 def test_the_best_is_the_lowest_of_the_fastest():
-    assert orders.best({8: 2.0, 10: 1.01, 12: 1.0, 14: 1.005}) == 10
-    assert orders.best({8: 2.0, 10: 1.1, 12: 1.0}) == 12
+    assert orders.best_order({8: 2.0, 10: 1.01, 12: 1.0, 14: 1.005}) == 10
+    assert orders.best_order({8: 2.0, 10: 1.1, 12: 1.0}) == 12
 
 
 @pytest.mark.parametrize(

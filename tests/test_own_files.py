@@ -14,7 +14,7 @@ import pytest
 from lag_envs import own_files
 from lag_envs.benchmark import cold_start, contestants
 from lag_envs.benchmark.actions import actions_of
-from lag_envs.benchmark.measurement import Settings, bench
+from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.cli import main
 from lag_envs.errors import UserError
 
@@ -131,7 +131,7 @@ def test_another_file_replaces_what_was_registered(write):
 def test_neighbours_can_be_imported(write):
     write(SCENE, "swings.py")
     path = write("from swings import Swing\n" + TASK)
-    assert list(own_files.chosen(path)) == ["Pump"]
+    assert list(own_files.chosen_tasks(path)) == ["Pump"]
     assert own_files.scenes(path) == {}
 
 
@@ -139,7 +139,7 @@ def test_the_name_of_another_module_is_left_to_it(write):
     import json
 
     path = write(SCENE + TASK, "json.py")
-    assert own_files.load(path).__name__ == "own_json"
+    assert own_files.load_module(path).__name__ == "own_json"
     assert sys.modules["json"] is json
 
 
@@ -230,7 +230,7 @@ def test_bench_takes_tasks_of_a_file(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(contestants, "PEERS", [])
     ids = tuple(own_files.registered(SEVERAL))
     assert ids == ("OwnCrane-v0", "OwnSwitched-v0", "OwnDrift-v0")
-    settings = Settings(ids[-1:], (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
+    settings = BenchmarkSettings(ids[-1:], (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
     rows = [row for row in bench(settings)["rows"] if row["library"] == "lag_envs"]
     assert len(rows) == 3 and all(row["rates"] for row in rows), [row["problem"] for row in rows]
 
@@ -256,9 +256,9 @@ def test_cold_start_of_a_file(tmp_path):
 
 
 def _mapped(env, *names):
-    from lag_envs.play import action_of, resting
+    from lag_envs.play import pressed_action, resting
 
-    return action_of(env.action_space, names.__contains__, resting(env.unwrapped.task))
+    return pressed_action(env.action_space, names.__contains__, resting(env.unwrapped.task))
 
 
 def test_keys_become_actions():
@@ -295,7 +295,7 @@ def test_steps_keep_their_bounds(kind, monkeypatch):
     from lag_envs.report import own
 
     (subject,) = own.subjects(f"{SEVERAL}:{kind}")
-    rows = list(own.steps(f"{SEVERAL}:{kind}", "", True, subject.name))
+    rows = list(own.shipped_steps(f"{SEVERAL}:{kind}", "", True, subject.name))
     exact = [row for row in rows if row["kind"] == "step"]
     assert len(exact) >= 1
     assert max(row["beyond"] for row in exact) < own.ROUNDING
@@ -335,7 +335,7 @@ def test_a_balance_of_quick_motion_needs_finer_quadrature(write):
     (subject,) = own.subjects(f"{SEVERAL}:Deliver")
     light = dataclasses.replace(subject.scene, load_mass=1e-4)
     start, held = np.array([0.0, 0.0, 1.06, 0.7, 0.22, -0.6]), np.array([-9.5, 6.0])
-    assert own.balance(light, start, held, subject.dt) < 1e-11
+    assert own.step_imbalance(light, start, held, subject.dt) < 1e-11
     coarse = light.energy_balance(start, held, subject.dt)
     assert abs(coarse["residual"]) > 1e-3 * abs(coarse["work"])
 

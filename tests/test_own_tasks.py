@@ -49,11 +49,11 @@ def test_vector_is_single(id, n):
     ends = 0
     for _ in range(steps):
         action = native.action_space.sample()
-        ours, theirs = native.step(action), single.step(action)
-        ends += int((ours[2] | ours[3]).sum())
-        pairs += zip(ours[:4], theirs[:4], strict=True)
-    for ours, theirs in pairs:
-        np.testing.assert_array_equal(ours, theirs)
+        batched, alone = native.step(action), single.step(action)
+        ends += int((batched[2] | batched[3]).sum())
+        pairs += zip(batched[:4], alone[:4], strict=True)
+    for batched, alone in pairs:
+        np.testing.assert_array_equal(batched, alone)
     assert ends or n != 3
 
 

@@ -12,6 +12,7 @@ from mpmath import mp, mpf
 from sympy import cos, sin
 
 from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report.closed_forms import linear
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.symbolic import symbolic, t
@@ -21,7 +22,7 @@ SCENES = (PivotedBar, Incline, CylinderInCylinder)
 
 
 def vanishes(expression):
-    """Tell whether an expression, rational but for sines and cosines, is identically zero."""
+    """Return whether an expression, rational but for sines and cosines, is identically zero."""
     expression = sympy.numer(sympy.together(sympy.nsimplify(expression))).expand()
     for cosine in expression.atoms(cos):
         expression = expression.subs(cosine**2, 1 - sin(*cosine.args) ** 2).expand()
@@ -110,7 +111,7 @@ def test_forces_are_newton(scene):
     forces, laws = newton(scene)
     checked = set()
     for _ in range(20):
-        numbers = {name: float(rng.uniform(0.2, 1.0)) for name in scene._numbers() if name != "track"}
+        numbers = {name: float(rng.uniform(0.2, 1.0)) for name in parameter_names(scene) if name != "track"}
         if "shell_radius" in numbers:
             numbers["shell_radius"] += 1.0
         body = dataclasses.replace(scene, **numbers)

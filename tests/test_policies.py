@@ -16,9 +16,9 @@ from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.alike import Likeness, check_twins
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.kernels import affine
-from lag_envs.leaderboard.policies import ARCHITECTURES, Policy, architecture
+from lag_envs.leaderboard.policies import ARCHITECTURES, SubmittedPolicy, architecture
 from lag_envs.leaderboard.submission import Refused, load, write
-from lag_envs.leaderboard.verify import replay, verify
+from lag_envs.leaderboard.verify import record_again, verify
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
 from lag_envs.tasks.record import Goal
@@ -91,7 +91,7 @@ def numbers(env, policy, seed=0):
 
 
 def agent(env, policy, seed=0):
-    return Policy(architecture(env, policy), numbers(env, policy, seed)).agent()
+    return SubmittedPolicy(architecture(env, policy), numbers(env, policy, seed)).agent()
 
 
 def submission(folder, env, policy, **changed):
@@ -195,7 +195,7 @@ def test_a_plan_is_followed_and_held():
     }
     names = TwoLinkArm().state_names
     assert names == ("theta_1", "theta_1_dot", "theta_2", "theta_2_dot")
-    acting = Policy(made, arrays).agent()
+    acting = SubmittedPolicy(made, arrays).agent()
     observation = np.array([math.cos(0.3), math.sin(0.3), 1.0, 0.0, 0.0, 0.15])
     told, memory = [], None
     for _ in range(4):
@@ -208,12 +208,14 @@ def test_a_plan_is_followed_and_held():
 def test_a_plan_does_what_the_controller_of_such_numbers_does(tmp_path):
     """Also where it acts ten times as often."""
     env = incline.Tilt.id
-    ours = Tracking(TASKS[env](), **numbers(env, PLAN))
+    tracking = Tracking(TASKS[env](), **numbers(env, PLAN))
     made = submission(tmp_path / "a", env, PLAN)
     assert made.kind == "controller"
     for options in ({}, often(env).options):
-        theirs = made.policies[0][1].agent()
-        assert np.array_equal(play(env, theirs, range(3), **options), play(env, ours, range(3), **options))
+        submitted = made.policies[0][1].agent()
+        assert np.array_equal(
+            play(env, submitted, range(3), **options), play(env, tracking, range(3), **options)
+        )
 
 
 @pytest.mark.slow
@@ -224,7 +226,7 @@ def test_listed_actions_go_through_the_board(env, tmp_path):
     made = submission(tmp_path / "a", env, policy)
     result = verify(made, "nonce", 3)
     assert result["often"] and len(result["policies"][0]["returns"]) == 3
-    told, episodes = replay(made, result, 1, [2])
+    told, episodes = record_again(made, result, 1, [2])
     assert told["returns"] == result["policies"][1]["returns"][2:]
     sizes = TASKS[env]().formulas.choices
     actions = np.reshape(episodes[0]["actions"], (-1, len(sizes)))

@@ -15,7 +15,7 @@ from trainings import go, kill_and_interrupt
 
 import lag_envs
 from agents import learners, ppo, race, submit, train, tune
-from agents.learners import hyperparameters, load_policy
+from agents.learners import load_policy, zoo_hyperparameters
 from agents.run import CHECKPOINT, MODEL, RESULT, Run, UserError, fresh_seeds
 from lag_envs.evaluation.rollout import play
 from lag_envs.leaderboard.export import ExportError, arrays_of, export, find
@@ -96,7 +96,9 @@ def own():
 
 
 def make_run(folder, env_id=ENV, seed=3, steps=768, **more):
-    return Run(Path(folder), env_id, ppo.NAME, seed, steps, hyperparameters(ppo.NAME, env_id) | SHORT | more)
+    return Run(
+        Path(folder), env_id, ppo.NAME, seed, steps, zoo_hyperparameters(ppo.NAME, env_id) | SHORT | more
+    )
 
 
 def learnt(run):
@@ -183,7 +185,7 @@ def test_it_swings_the_bar_up(tmp_path, monkeypatch):
     env_id = pivoted_bar.SwingUp.id
     scores = []
     for seed in range(300, 305):
-        hyper = hyperparameters(ppo.NAME, env_id)
+        hyper = zoo_hyperparameters(ppo.NAME, env_id)
         run = Run(tmp_path / str(seed), env_id, ppo.NAME, seed, int(hyper["n_timesteps"]), hyper)
         go(run)
         scores.append(score(env_id, json.loads(run.path(RESULT).read_text())["mean_return"]))
@@ -194,7 +196,7 @@ def test_it_swings_the_bar_up(tmp_path, monkeypatch):
 
 
 def make_learner(env_id=ENV, **more):
-    settings = ppo.Settings.of(hyperparameters(ppo.NAME, env_id) | SHORT | more)
+    settings = ppo.Settings.of(zoo_hyperparameters(ppo.NAME, env_id) | SHORT | more)
     return ppo.Learner(env_id, settings, 0, 10_000)
 
 
@@ -206,7 +208,9 @@ def test_advantages_are_sums_of_later_surprises():
     over, terminated = np.zeros(shape, bool), np.zeros(shape, bool)
     over[2, 0] = over[3, 1] = terminated[3, 1] = True
     draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
-    found = ppo.Rollout(draw(7, 2, wide), draw(*shape, 1), draw(*shape), terminated, over, draw(*shape, wide))
+    found = ppo.Experience(
+        draw(7, 2, wide), draw(*shape, 1), draw(*shape), terminated, over, draw(*shape, wide)
+    )
     advantages, targets = learner.advantages(found)
 
     def value(observation):
@@ -315,7 +319,7 @@ def test_mistakes_are_named(given, message, tmp_path, capsys):
 
 
 def test_settings_of_another_kind_are_refused():
-    good = hyperparameters(ppo.NAME, ENV)
+    good = zoo_hyperparameters(ppo.NAME, ENV)
     for changes, message in (
         ({"gama": 0.9}, "gama is an unknown key"),
         ({"state_noise": 1}, "state_noise: Input should be a valid boolean, got 1"),
@@ -331,7 +335,7 @@ def test_settings_of_another_kind_are_refused():
 
 
 def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
-    settings = ppo.Settings.of(hyperparameters(ppo.NAME, ENV) | SHORT)
+    settings = ppo.Settings.of(zoo_hyperparameters(ppo.NAME, ENV) | SHORT)
     lag_envs.register(pivoted_bar.SwingUpFree, id="OwnEndless-v0", duration=float("inf"))
     try:
         with pytest.raises(UserError, match="have no end; give it a duration"):
@@ -343,12 +347,12 @@ def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
 def test_five_seeds_are_a_submission(tmp_path):
     for seed in range(5):
         go(make_run(tmp_path / "runs" / ENV / ppo.NAME / f"seed{seed}", seed=seed))
-    made = submit.learned(ENV, tmp_path / "runs" / ENV / ppo.NAME, tmp_path / "out")
+    made = submit.submit_learned(ENV, tmp_path / "runs" / ENV / ppo.NAME, tmp_path / "out")
     assert made.name == "fast PPO" and len(load(tmp_path / "out").policies) == 5
     seen = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
-    ours = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
-    theirs = dict(load(tmp_path / "out").policies)[2].agent()
-    np.testing.assert_array_equal(ours.predict(seen)[0], theirs.predict(seen)[0])
+    loaded = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
+    submitted = dict(load(tmp_path / "out").policies)[2].agent()
+    np.testing.assert_array_equal(loaded.predict(seen)[0], submitted.predict(seen)[0])
     # A file alone does not tell how long it was trained.
     file = tmp_path / "runs" / ENV / ppo.NAME / "seed2" / MODEL
     with pytest.raises(ExportError, match="not known how long it was trained; give --env-steps"):
@@ -364,19 +368,19 @@ def test_networks_of_any_actions_act_as_on_the_leaderboard(task, tmp_path):
     layers = [(draw(8, wide), draw(8)), (draw(outputs, 8), draw(outputs))]
     ppo.Policy(layers, formulas.choices, formulas.largest).save(file)
     table, arrays = arrays_of(file)
-    theirs, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
+    submitted, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
     policy = ppo.Policy.load(file)
-    ours = policy.predict(seen)[0]
-    np.testing.assert_array_equal(ours, theirs.predict(seen)[0])
-    assert np.ptp(ours) >= formulas.largest
+    loaded = policy.predict(seen)[0]
+    np.testing.assert_array_equal(loaded, submitted.predict(seen)[0])
+    assert np.ptp(loaded) >= formulas.largest
     # To the bit, however many act together.
-    np.testing.assert_array_equal(ours[:7], policy.predict(seen[:7])[0])
-    np.testing.assert_array_equal(ours[0], policy.predict(seen[0])[0])
+    np.testing.assert_array_equal(loaded[:7], policy.predict(seen[:7])[0])
+    np.testing.assert_array_equal(loaded[0], policy.predict(seen[0])[0])
 
 
 def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     file = tmp_path / "tuning.json"
-    monkeypatch.setattr(tune, "hyperparameters", lambda *_: hyperparameters(ppo.NAME, ENV) | SHORT)
+    monkeypatch.setattr(tune, "zoo_hyperparameters", lambda *_: zoo_hyperparameters(ppo.NAME, ENV) | SHORT)
     monkeypatch.setattr(tune, "CHOICES", {"gamma": (0.9, 0.95), "ent_coef": (0.1, 0.2), "critic": ([8], [9])})
     monkeypatch.setattr(tune.workers, "processes", here)
     given = [ENV, "--settings", "2", "--seeds", "1", "--steps", "256", "--episodes", "2"]
@@ -405,15 +409,18 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
 
 def test_every_setting_that_may_be_drawn_is_one():
     for number in range(200):
-        ppo.Settings.of(hyperparameters(ppo.NAME, ENV) | tune.drawn(number))
-    assert tune.drawn(1) == tune.drawn(1) != tune.drawn(2)
+        ppo.Settings.of(zoo_hyperparameters(ppo.NAME, ENV) | tune.drawn_changes(number))
+    assert tune.drawn_changes(1) == tune.drawn_changes(1) != tune.drawn_changes(2)
 
 
 @pytest.mark.parametrize("names", [("fast_ppo",), slow(("fast_ppo", "ppo"))])
 def test_race_tells_when_levels_are_reached(names, tmp_path, monkeypatch, capsys):
     file, picture = tmp_path / "race.jsonl", tmp_path / "race.png"
-    short = lambda name, env: hyperparameters(name, env) | SHORT | ({"n_steps": 8} if name == "ppo" else {})  # noqa: E731
-    monkeypatch.setattr(race, "hyperparameters", short)
+
+    def short(name, env):
+        return zoo_hyperparameters(name, env) | SHORT | ({"n_steps": 8} if name == "ppo" else {})
+
+    monkeypatch.setattr(race, "zoo_hyperparameters", short)
     monkeypatch.setattr(race, "EPISODES", 2)
     monkeypatch.setattr(race, "LEVELS", (-9.0, 9.0))
     monkeypatch.setattr(race.workers, "processes", here)

@@ -8,8 +8,8 @@ import pytest
 from lag_envs.controllers import make_controller
 from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import RESAMPLES, THRESHOLDS, ends, iqm
-from lag_envs.leaderboard.combined import Agent, Result, combined
-from lag_envs.leaderboard.protocol import Reference, reference
+from lag_envs.leaderboard.combined import AgentIdentity, AgentScore, combined
+from lag_envs.leaderboard.protocol import ReferenceController, reference
 from lag_envs.leaderboard.ranking import (
     Scores,
     columns,
@@ -170,7 +170,7 @@ def test_columns_of_a_row():
 # --- luck ---
 
 
-MEAN = Reference("LQR", 452.7, 0.139, 524_288)
+MEAN = ReferenceController("LQR", 452.7, 0.139, 524_288)
 
 
 def test_luck_is_taken_out():
@@ -212,7 +212,7 @@ def test_the_reference_has_its_own_mean_and_the_error_of_that():
 @pytest.mark.parametrize("policies", [1, 5])
 @pytest.mark.parametrize("part", [0.0, 0.5, 1.0, 2.0])
 def test_every_interval_holds_the_error_of_the_references_mean(part, policies):
-    """To the extent that a row was corrected by it, whatever the row."""
+    """In proportion to the row's correction by the reference, for any row."""
     rng = np.random.default_rng(2)
     luck = rng.normal(0.0, 50.0, (policies, 1000))
     noise = rng.normal(0.0, 3.0, (policies, 1000))
@@ -244,7 +244,7 @@ def test_intervals_of_corrected_rows_cover_the_truth():
     rng, error, inside = np.random.default_rng(4), 4.0, {"reference": 0, "like": 0, "learner": 0}
     rounds = 120
     for k in range(rounds):
-        measured = Reference("x", 400.0 + error * rng.normal(), error, 1)  # the truth is 400
+        measured = ReferenceController("x", 400.0 + error * rng.normal(), error, 1)  # the truth is 400
         seeds = rng.normal(300.0, 2.0, 10)
 
         def play(part, means, k=k, measured=measured):
@@ -279,7 +279,7 @@ def test_references_are_controllers_that_are_known_and_help(env_id):
 @pytest.mark.parametrize(
     "env_id", [pytest.param(i, marks=[] if i == ENV else pytest.mark.slow) for i in REFERENCES]
 )
-def test_means_of_references_are_theirs(env_id):
+def test_means_of_references_are_those_of_the_controllers(env_id):
     """Not another controller's, and not another's error."""
     name, mean, error, episodes = reference(env_id)
     few = play(env_id, make_controller(env_id, name), range(10**10, 10**10 + 500))
@@ -293,15 +293,18 @@ def test_means_of_references_are_theirs(env_id):
 
 
 def test_combined_scores_by_hand():
-    """Clipped to [0, 1], missing boards are 0, boards without anybody do not count."""
-    alice, bob = Agent("A", ("Alice",)), Agent("A", ("Bob",))
+    """Clipped to [0, 1], a missing board counts 0, and boards without agents do not count."""
+    alice, bob = AgentIdentity("A", ("Alice",)), AgentIdentity("A", ("Bob",))
     steady = np.linspace(0.0, 1.0, 1001)
     boards = {
-        "one": {alice: Result(1.2, np.full(1001, 1.2), "learned"), bob: Result(0.5, steady, "controller")},
-        "two": {alice: Result(-3.0, np.full(1001, -3.0), "learned")},
-        "three": {bob: Result(0.9, np.full(1001, 0.9), "learned")},
+        "one": {
+            alice: AgentScore(1.2, np.full(1001, 1.2), "learned"),
+            bob: AgentScore(0.5, steady, "controller"),
+        },
+        "two": {alice: AgentScore(-3.0, np.full(1001, -3.0), "learned")},
+        "three": {bob: AgentScore(0.9, np.full(1001, 0.9), "learned")},
         "none": {},
-        "four": {alice: Result(0.95, np.full(1001, 0.95), "learned")},
+        "four": {alice: AgentScore(0.95, np.full(1001, 0.95), "learned")},
     }
     first, second = combined(boards)
     assert (first["name"], first["authors"], first["kind"]) == ("A", ["Alice"], "learned")

@@ -11,9 +11,9 @@ from lag_envs import scenes
 from lag_envs.controllers import build, controllers
 from lag_envs.hyperparams import DEFAULTS, OFF_POLICY, learners
 from lag_envs.scores import share_of_privileged
-from lag_envs.tasks import TASKS, find
+from lag_envs.tasks import TASKS, find_tasks
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 from tools.missing import COMMANDS, have, missing
 
 ROOT = Path(__file__).parents[1]
@@ -60,7 +60,7 @@ def test_no_id_is_put_together():
 
 def test_tasks_are_found():
     """Reading the files finds the same as importing them: every task with an id, in its module."""
-    places = find(Path(ROOT, "src/lag_envs/tasks"), "lag_envs.tasks.")
+    places = find_tasks(Path(ROOT, "src/lag_envs/tasks"), "lag_envs.tasks.")
     assert places == TASKS.data
     assert next(iter(TASKS)) == EXAMPLE
     for env_id, task in TASKS.items():
@@ -131,7 +131,7 @@ def test_what_lacks_is_told_with_its_command(monkeypatch):
 
 @pytest.mark.parametrize("env_id", have("returns"))
 def test_what_was_measured_is_there(env_id):
-    found = measured(env_id)
+    found = measured_entry(env_id)
     assert {"random", "zero", found["scale"]["policy"]} <= set(found["measured"])
     assert ("reference" in found) == bool(TASKS[env_id].reference)
     assert ("optimum" in found["scale"]) == ("optimum" in found["measured"]) == bool(TASKS[env_id].optimum)

@@ -24,7 +24,7 @@ from rollouts import SINGLE
 import lag_envs
 from lag_envs.envs import raster, rendering
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.scenes.picture import Picture, turning
+from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import (
     Arrow,
     Circle,
@@ -182,8 +182,8 @@ def test_poses_of_an_episode_are_those_of_its_moments():
         controls = task.wanted(rng.uniform(-1, 1, (5, task.formulas.actions)))
         poses = picture.episode(states, controls, 0.2, task.dt)
         target = 0.2 if task.formulas.targets else None
-        turned = np.zeros(len(turning(task.scene, states[0])))
-        rates = [np.array(turning(task.scene, state)) for state in states]
+        turned = np.zeros(len(left_out_rates(task.scene, states[0])))
+        rates = [np.array(left_out_rates(task.scene, state)) for state in states]
         for i, state in enumerate(states):
             control = controls[i - 1] if i else np.zeros(len(controls[0]))
             turned = turned + (0.5 * task.dt * (rates[i - 1] + rates[i]) if i else 0.0)
@@ -852,8 +852,8 @@ def test_pictures_are_those_of_the_page(env_id, page):
 
     task = TASKS[env_id]
     now, picture = moment(task), Picture(task)
-    theirs = page.evaluate(PAINT, [scenery.picture(picture), picture.poses(now), rendering.MARGIN])
-    png = io.BytesIO(base64.b64decode(theirs.partition(",")[2]))
-    theirs = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
-    apart = np.abs(theirs - rendering.paint(task, now)).max(axis=2)
+    by_page = page.evaluate(PAINT, [scenery.picture_data(picture), picture.poses(now), rendering.MARGIN])
+    png = io.BytesIO(base64.b64decode(by_page.partition(",")[2]))
+    by_page = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
+    apart = np.abs(by_page - rendering.paint(task, now)).max(axis=2)
     assert apart.mean() < 0.4 and np.mean(apart > 64) < 0.001, (apart.mean(), np.mean(apart > 64))

@@ -28,7 +28,7 @@ def driven(task, seed=5, name=None, most=200):
         key = tuple((i + j) % n for j, n in enumerate(choices)) or tuple(
             (-64, 64, 0, 3)[(i + j) % 4] for j in range(task.formulas.actions)
         )
-        _, reward, terminated, truncated = env.step(replay.action_of(key, task))
+        _, reward, terminated, truncated = env.step(replay.action_from_numbers(key, task))
         total, over = total + reward, terminated or truncated
         keys.append(key)
     return replay.Drive(name or task.id, seed, replay.pack(keys), total, env.program.digest)

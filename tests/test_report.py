@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from lag_envs.cli import main
 from lag_envs.report import docs, page
-from lag_envs.report.report import SECTIONS, NotAReport, Settings, content_of, make_report, prepare
-from lag_envs.report.runner import load, module, run_jobs
+from lag_envs.report.report import SECTIONS, NotAReport, ReportSettings, content_of, make_report, prepare
+from lag_envs.report.runner import load_results, module, run_jobs
 from tests import dummy_section
 from tests.dummy_section import job
 
@@ -25,7 +25,7 @@ PROJECT = Path(__file__).parents[1]
 
 
 def settings(folder, **changes):
-    return Settings(str(folder), sections=(dummy_section.SECTION,), processes=1, **changes)
+    return ReportSettings(str(folder), sections=(dummy_section.SECTION,), processes=1, **changes)
 
 
 # --- jobs ---
@@ -66,7 +66,7 @@ def test_finished_jobs_are_kept_and_failed_ones_tried_again(tmp_path):
     run_jobs(jobs, tmp_path, 1)
     run_jobs(jobs, tmp_path, 1)
     assert log.read_text() == "x"
-    assert [r.name for r in load(tmp_path / "results.jsonl")] == ["works", "fails", "fails"]
+    assert [r.name for r in load_results(tmp_path / "results.jsonl")] == ["works", "fails", "fails"]
     run_jobs([replace(jobs[0], arguments={"count": 2, "log": str(log)})], tmp_path, 1)
     assert log.read_text() == "xx"  # other arguments, another job
 
@@ -78,7 +78,7 @@ def test_a_line_that_was_cut_off(tmp_path):
     file.write_text(file.read_text()[:-30])
     results, _ = run_jobs(jobs, tmp_path, 1)
     assert [len(r.rows) for r in results] == [1, 2]
-    assert [r.name for r in load(file)] == ["works", "two"]
+    assert [r.name for r in load_results(file)] == ["works", "two"]
 
 
 def test_timings_run_alone(tmp_path):
@@ -86,7 +86,7 @@ def test_timings_run_alone(tmp_path):
     begin = time.monotonic()
     results, _ = run_jobs([*alone, job("first", count=1)], tmp_path, 2)
     assert time.monotonic() - begin > 0.4
-    assert load(tmp_path / "results.jsonl")[0].name == "first"
+    assert load_results(tmp_path / "results.jsonl")[0].name == "first"
     assert len(results) == 3
 
 
@@ -111,11 +111,11 @@ def test_interrupt_keeps_what_is_finished(tmp_path):
     )
     file = tmp_path / "results.jsonl"
     end = time.monotonic() + 60
-    while time.monotonic() < end and not (file.exists() and load(file)):
+    while time.monotonic() < end and not (file.exists() and load_results(file)):
         time.sleep(0.1)
     child.send_signal(signal.SIGINT)
     assert child.communicate(timeout=30)[0].split() == ["1", "False"]
-    assert [r.name for r in load(file)] == ["works"]
+    assert [r.name for r in load_results(file)] == ["works"]
 
 
 # --- folder, page, tables ---
@@ -215,10 +215,10 @@ def test_compact_form(written, tmp_path, monkeypatch):
     (tmp_path / "README.md").write_text(marks["fast"])
     (tmp_path / "docs" / "speed.md").write_text(marks["fast"] + marks["bench"])
     monkeypatch.setattr(
-        docs, "PARTS", (docs.Part(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
+        docs, "PARTS", (docs.PagePart(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
     )
-    monkeypatch.setattr(docs.overview, "draw", lambda _: Figure())
-    monkeypatch.setattr(docs.overview, "findings", lambda _: ["Nobody is faster."])
+    monkeypatch.setattr(docs.overview, "draw_overview", lambda _: Figure())
+    monkeypatch.setattr(docs.overview, "overview_sentences", lambda _: ["Nobody is faster."])
     assert docs.main([str(written), str(tmp_path)]) == 0
     text = (tmp_path / "docs" / "accuracy-details.md").read_text(encoding="utf-8")
     assert "| There are five. | **holds** | 5 found |" in text

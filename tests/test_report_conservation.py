@@ -8,6 +8,7 @@ import pytest
 from covering import PERFECT, covering
 
 from lag_envs.report import conservation, leave_out
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks import TASKS
 
 
@@ -16,7 +17,7 @@ def claims(content):
 
 
 #: Those whose scene has a dedicated flow.
-FORMS = [id for id in TASKS if TASKS[id]().scene._form is not None]
+FORMS = [id for id in TASKS if form_of(TASKS[id]().scene) is not None]
 
 
 def task(id, **keywords):
@@ -27,10 +28,10 @@ def task(id, **keywords):
 def runs():
     rows = []
     for name in conservation.FREE:
-        rows += conservation.free(name, conservation.OURS, 10_000)
+        rows += conservation.free(name, conservation.LAG_ENVS, 10_000)
     for method in ("RK4", "Verlet"):
         rows += conservation.free("bar, 2 rad", method, 10_000)
-    return [*rows, *conservation.balance("CylinderInCylinder, tilt", 20)]
+    return [*rows, *conservation.energy_imbalance("CylinderInCylinder, tilt", 20)]
 
 
 def test_claims_hold(runs):
@@ -43,8 +44,8 @@ def test_claims_hold(runs):
         assert picture.draw().axes
 
 
-def test_energy_of_ours_and_of_others(runs):
-    """Ours is at rounding; Verlet's drift is bounded and RK4's grows, as in theory."""
+def test_energy_of_lag_envs_and_of_others(runs):
+    """lag_envs is at rounding; Verlet's drift is bounded and RK4's grows, as in theory."""
     drift = {(r["name"], r["method"]): r for r in runs if r["kind"] == "drift"}
     for name in conservation.FREE:
         limit = 1e-12 if name == "incline" else 1e-13
@@ -58,7 +59,7 @@ def test_energy_of_ours_and_of_others(runs):
 def test_march_is_simulate():
     """The loop of the long runs gives the bits of `Scene.simulate`."""
     problem = conservation.FREE["bar, turning over"]
-    end = conservation.run(problem, conservation.OURS, np.array([7, 1000]))
+    end = conservation.lifted_run(problem, conservation.LAG_ENVS, np.array([7, 1000]))
     path = problem.scene.simulate(problem.state, np.zeros(1000), problem.dt)
     np.testing.assert_array_equal(end[:, :2], path[[7, 1000]])
 
@@ -80,7 +81,7 @@ def test_a_broken_balance_is_seen(runs):
 
 @pytest.mark.parametrize("id", covering(FORMS))
 def test_nothing_is_carried_for_nothing(id):
-    row = leave_out.carried(task(id))
+    row = leave_out.carried_numbers(task(id))
     assert (row["unused"], row["idle"]) == ([], [])
     assert row["operations"] > 0 and row["stages"]
 
@@ -102,12 +103,12 @@ def test_what_is_left_out_saves_operations():
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, problem in conservation.FREE.items() if problem.scene._form.angle is not None]
+    "name", [name for name, problem in conservation.FREE.items() if form_of(problem.scene).angle is not None]
 )
 def test_cosine_and_sine_stay_a_pair(name):
     """c² + s² does not grow; θ differs from the pair's angle only by its own accumulated roundings."""
     at = conservation.marks(100_000)
-    theta, _, c, s = conservation.run(conservation.FREE[name], conservation.OURS, at).T
+    theta, _, c, s = conservation.lifted_run(conservation.FREE[name], conservation.LAG_ENVS, at).T
     assert np.abs(c * c + s * s - 1.0).max() < 1e-15
     turns = (theta - np.arctan2(s, c)) / (2.0 * math.pi)
     apart = 2.0 * math.pi * np.abs(turns - np.round(turns))
@@ -123,7 +124,7 @@ def test_every_constant_changes_something(id):
     """Change each constant, by 1e-3 unless stated otherwise: the results of a start or step differ."""
     env = gym.make(id).unwrapped
     env.reset(seed=1)
-    program, rows, angle = env._program, env._rows.copy(), env.task.scene._form.angle
+    program, rows, angle = env._program, env._rows.copy(), form_of(env.task.scene).angle
     first, n = len(program.kept + program.scratch), len(program.y)
     rng = np.random.default_rng(2)
     starts = []

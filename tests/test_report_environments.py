@@ -13,11 +13,12 @@ from rollouts import actions
 
 from lag_envs.report import environment_results, environments, episodes, gymnasium_peers
 from lag_envs.report.bound import Driven
-from lag_envs.report.episodes import Episode, play, random_actions, replay
+from lag_envs.report.episodes import RecordedEpisode, endless_actions, exact_states, record_episode
 from lag_envs.report.integrators import comparison
 from lag_envs.report.oracle import Oracle, oracle_of
-from lag_envs.report.runner import Result
+from lag_envs.report.runner import JobResult
 from lag_envs.report.stepped import Stepped
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS, cart_pole, cylinder_in_cylinder, incline, pivoted_bar
 
@@ -63,10 +64,10 @@ def short_episode(id, seconds=1.0, seed=0):
     env = gym.make(id).unwrapped
     env.reset(seed=seed)
     steps = round(seconds / peer.step(env))
-    actions = random_actions(env, seed)
+    actions = endless_actions(env, seed)
     if id == "Pendulum-v1":
         actions = map(np.float64, actions)  # with float32 it rounds the torque's part to float32
-    return env, peer, gymnasium_peers.watch(env, peer, actions, steps, to_the_end=False)
+    return env, peer, gymnasium_peers.record_peer(env, peer, actions, steps, to_the_end=False)
 
 
 @pytest.mark.parametrize("id", gymnasium_peers.PEERS)
@@ -91,21 +92,21 @@ def test_peers_exact_states_agree_with_dop853(id):
         y = integrate.solve_ivp(
             lambda t, y, f=rates: f(y), (0, peer.step(env)), y, "DOP853", rtol=1e-13, atol=1e-13
         ).y[:, -1]
-    exact = gymnasium_peers.solve(env, peer, episode.states[0], episode.controls)[-1]
+    exact = gymnasium_peers.solve_peer(env, peer, episode.states[0], episode.controls)[-1]
     np.testing.assert_allclose(np.array(exact, dtype=float), y, rtol=0, atol=1e-11)
 
 
 def test_exact_states_are_those_of_equations_that_are_typed_in():
     """Pendulum-v1 and the bar as driven pendulums, with coefficients by hand in exact fractions."""
     env, peer, episode = short_episode("Pendulum-v1")
-    path = gymnasium_peers.solve(env, peer, episode.states[0], episode.controls)
+    path = gymnasium_peers.solve_peer(env, peer, episode.states[0], episode.controls)
     given = [({"alpha": -15, "delta": 3 * Fraction(u)}, env.dt) for u in episode.controls]
     same(path, episode.states[0], given)
 
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)
-    episode = play(env, random_actions(env, 0))
-    path = replay(env.task, 0, episode.states[0], episode.controls, 34)
+    episode = record_episode(env, endless_actions(env, 0))
+    path = exact_states(env.task, 0, episode.states[0], episode.controls, 34)
     names = "mass", "com_distance", "inertia", "damping", "gravity"
     m, arm, i, b, g = (Fraction(getattr(env.scene, name)) for name in names)
     about = m * arm**2 + i
@@ -135,10 +136,10 @@ def test_one_second_of_every_environment(id):
 
     Exact steps take long: for environments that act 500 times a second, less than a second has to do.
     """
-    (row,) = environments.ours(id, seed=0, duration=min(1.0, 150 * TASKS[id].interval))
+    (row,) = environments.own_episode(id, seed=0, duration=min(1.0, 150 * TASKS[id].interval))
     assert row["seconds"] > 0.2
     assert row["disagreement"] < 1e-25
-    if TASKS[id]().scene._form is None:
+    if form_of(TASKS[id]().scene) is None:
         assert 0.0 < row["error"]["one step"] <= TOLERANCE and row["error"]["the end"] <= 1e-12
         return
     assert row["error"]["the end"] <= ONE_SECOND
@@ -148,20 +149,20 @@ def test_one_second_of_every_environment(id):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("id", [i for i in PERFECT if TASKS[i]().scene._form])
+@pytest.mark.parametrize("id", [i for i in PERFECT if form_of(TASKS[i]().scene)])
 def test_every_step_of_whole_episodes(id, seed):
     """README's statement on random actions; beside it long pushes that spin a bar round and round."""
-    (row,) = environments.ours(id, seed)
+    (row,) = environments.own_episode(id, seed)
     assert row["error"]["one step"] < environment_results.LARGEST_STEP
     assert stubborn(id, seed)["error"]["one step"] < 1e-14
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("id", [i for i in PERFECT if not TASKS[i]().scene._form])
+@pytest.mark.parametrize("id", [i for i in PERFECT if not form_of(TASKS[i]().scene)])
 def test_every_step_of_a_series(id):
     """The same for an episode's beginning: exact steps of these scenes take long."""
     duration = 100 * TASKS[id].interval
-    (row,) = environments.ours(id, 1, duration)
+    (row,) = environments.own_episode(id, 1, duration)
     assert row["error"]["one step"] < 1e-12
     assert stubborn(id, 1, duration=duration)["error"]["one step"] < 1e-12
 
@@ -170,7 +171,7 @@ def stubborn(id, seed, **options):
     """Return the row of an episode with actions that are held for a long time."""
     env = gym.make(id, disable_env_checker=True, **options)
     env.reset(seed=seed)
-    episode = play(env, iter(actions(10_000, env.action_space, seed=seed + 9)))
+    episode = record_episode(env, iter(actions(10_000, env.action_space, seed=seed + 9)))
     return environments.against_exact(env.unwrapped.task, episode, seed)
 
 
@@ -178,7 +179,7 @@ def test_one_step_is_the_worst_of_all_steps():
     """A single wrong step late in the episode shows, in its own entry, and nowhere else."""
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0)
     env.reset(seed=0)
-    episode = play(env, random_actions(env, 0))
+    episode = record_episode(env, endless_actions(env, 0))
     task, late = env.unwrapped.task, len(episode.controls) - 3
     right = environments.against_exact(task, episode, 0)
     assert right["error"]["one step"] < environment_results.LARGEST_STEP
@@ -195,27 +196,29 @@ def test_one_step_is_the_worst_of_all_steps():
 def test_one_step_of_peers_is_the_worst_of_all_steps():
     """Explicit Euler's error of a step is h²/2 of the second derivative: larger once the pole falls."""
     env, peer, episode = short_episode("CartPole-v1")
-    row = gymnasium_peers.measure(env, peer, episode)
-    first = gymnasium_peers.measure(env, peer, Episode(episode.states[:2], episode.controls[:1], False))
+    row = gymnasium_peers.measure_peer(env, peer, episode)
+    first = gymnasium_peers.measure_peer(
+        env, peer, RecordedEpisode(episode.states[:2], episode.controls[:1], False)
+    )
     assert row["error"]["one step"] > first["error"]["one step"] > 1e-6
 
 
 def test_kicks_are_part_of_the_exact_states(monkeypatch):
     """With this seed there is one before the bar has fallen."""
-    (row,) = environments.ours(pivoted_bar.Balance.id, seed=4)
+    (row,) = environments.own_episode(pivoted_bar.Balance.id, seed=4)
     assert row["error"]["the end"] < ONE_SECOND
     monkeypatch.setattr(episodes, "episode_key", lambda key, episode: 0)
-    (row,) = environments.ours(pivoted_bar.Balance.id, seed=4)
+    (row,) = environments.own_episode(pivoted_bar.Balance.id, seed=4)
     assert row["error"]["the end"] > 0.01
 
 
 @pytest.fixture(scope="module")
 def rows():
     jobs = [
-        environments.ours(incline.Brake.id, 0, 1.0),
-        environments.ours(cylinder_in_cylinder.Pump.id, 0, 1.0),
-        environments.ours(cart_pole.CartPoleExact.id, 0, 1.0),
-        environments.theirs("Pendulum-v1", 1, 1.0),
+        environments.own_episode(incline.Brake.id, 0, 1.0),
+        environments.own_episode(cylinder_in_cylinder.Pump.id, 0, 1.0),
+        environments.own_episode(cart_pole.CartPoleExact.id, 0, 1.0),
+        environments.peer_episode("Pendulum-v1", 1, 1.0),
         environments.undriven(),
         environments.undriven("Pendulum-v1"),
     ]
@@ -223,7 +226,9 @@ def rows():
 
 
 def test_small_report(rows):
-    content = environments.content(rows, [Result("environments", "Acrobot-v1, seed 0", "", problem="lost")])
+    content = environments.content(
+        rows, [JobResult("environments", "Acrobot-v1, seed 0", "", problem="lost")]
+    )
     assert [claim.holds for claim in content.claims] == [True] * len(content.claims)
     for table in (*content.tables, *content.details, content.summary):
         assert table.rows and all(len(line) == len(table.columns) for line in table.rows)
@@ -250,14 +255,14 @@ def test_undriven_pendulum(rows):
     angles = {row["case"]: environment_results._angle(row) for row in rows if row["seed"] is None}
     assert angles["Pendulum-v1, undriven"] == pytest.approx(0.178, abs=0.0005)
     assert angles[f"{pivoted_bar.SwingUpFree.id} with Pendulum-v1's equation, undriven"] < 2e-12
-    assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["ours"])
+    assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["own"])
 
 
 def test_a_worse_stepper_breaks_the_claims(rows):
-    """RK4, once per control step, in place of ours."""
+    """RK4, once per control step, in place of the shipped step."""
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)
-    episode = play(env, random_actions(env, 0))
+    episode = record_episode(env, endless_actions(env, 0))
     scene = Stepped(env.scene, comparison("RK4", Stepped(env.scene).flow))
     worse = episode._replace(states=scene.simulate(episode.states[0], episode.controls, env.task.dt))
     row = environments.against_exact(env.task, worse, seed=0)

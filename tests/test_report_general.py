@@ -9,13 +9,14 @@ from covering import slow
 
 from lag_envs.report import general, general_results
 from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
-from lag_envs.report.motions import Certified, SceneEquation, SceneProblems
+from lag_envs.report.motions import CertifiedSeries, SceneEquation, SceneProblems
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
-from lag_envs.report.reference import ends
-from lag_envs.report.rivals import Compiled
+from lag_envs.report.reference import exact_ends
+from lag_envs.report.rivals import CompiledMethod
 from lag_envs.scenes import Scene, parameter
+from lag_envs.scenes.derivation import order_of
 
 COUNT = 3
 
@@ -48,14 +49,14 @@ def problem(name):
     """Return a system's problems and their exact ends."""
     system = SYSTEMS[name]
     starts, controls = system.draw(COUNT)
-    return SceneProblems(system.scene, starts, controls, system), ends(
+    return SceneProblems(system.scene, starts, controls, system), exact_ends(
         system.scene, starts, controls, general_results.DT
     )
 
 
 def worst(rival, name, together=False):
     problems, truth = problem(name)
-    return general.errors(rival.build(problems, general_results.DT, 1, together).end(), truth)[0]
+    return general.worst_and_median(rival.build(problems, general_results.DT, 1, together).end(), truth)[0]
 
 
 # --- the reference ---
@@ -67,14 +68,14 @@ def test_what_moves_a_support(control):
     scene = Trolley(control=control)
     states = np.random.default_rng(1).uniform(-2, 2, (4, len(scene.state_names)))
     controls = np.random.default_rng(2).uniform(-2, 2, (4, 1))
-    truth = ends(scene, states, controls, 0.05)
+    truth = exact_ends(scene, states, controls, 0.05)
     problems = SceneProblems(scene, states, controls)
     for rival in (
-        Certified(Certified.method_of(18), 1e-14),
-        Compiled("DOP853", 8),
+        CertifiedSeries(CertifiedSeries.method_of(18), 1e-14),
+        CompiledMethod("DOP853", 8),
         CompiledRadau("Radau IIA", 200),
     ):
-        assert general.errors(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
+        assert general.worst_and_median(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
 
 
 # --- the rivals ---
@@ -113,12 +114,14 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
 
 @pytest.mark.parametrize("together", [False, True])
 @pytest.mark.parametrize("name", ["cart-pole", "double pendulum, driven"])
-def test_ours_is_what_simulate_does(name, together):
+def test_it_is_what_simulate_does(name, together):
     """The timed code has the bits of `simulate`."""
     problems, _ = problem(name)
-    order = int(problems.scene._order(general_results.DT))
+    order = int(order_of(problems.scene, general_results.DT))
     found = (
-        Certified(Certified.method_of(order), 1e-14).build(problems, general_results.DT, 1, together).end()
+        CertifiedSeries(CertifiedSeries.method_of(order), 1e-14)
+        .build(problems, general_results.DT, 1, together)
+        .end()
     )
     paths = [
         problems.scene.simulate(y, u[None], general_results.DT)[-1]
@@ -130,8 +133,8 @@ def test_ours_is_what_simulate_does(name, together):
 @pytest.mark.parametrize("name", ["cart-pole", slow("rotary pendulum")])
 def test_every_rival_converges(name):
     """No form is fast because it is broken."""
-    assert worst(Certified(Certified.method_of(12), 1e-6), name) < 1e-5
-    for rival in (Compiled("RK4", 256), Compiled("DOP853", 8), CompiledRadau("Radau IIA", 64)):
+    assert worst(CertifiedSeries(CertifiedSeries.method_of(12), 1e-6), name) < 1e-5
+    for rival in (CompiledMethod("RK4", 256), CompiledMethod("DOP853", 8), CompiledRadau("Radau IIA", 64)):
         assert worst(rival, name) < 1e-9, rival.method
     for family, setting, goal in (("mujoco", 128, 1e-9),):
         if importlib.util.find_spec(family):
@@ -152,16 +155,16 @@ def point(family, method, setting, error, ns, mode="single", batched=True, clock
 
 
 ROWS = [
-    point("ours", "lag_envs, order 8", 1e-4, 1e-5, 50.0),
-    point("ours", "lag_envs, order 16", 1e-12, 1e-13, 80.0),
-    point("ours", "lag_envs, order 16", 1e-12, 1e-13, 20.0, "batch"),
+    point("lag_envs", "lag_envs, order 8", 1e-4, 1e-5, 50.0),
+    point("lag_envs", "lag_envs, order 16", 1e-12, 1e-13, 80.0),
+    point("lag_envs", "lag_envs, order 16", 1e-12, 1e-13, 20.0, "batch"),
     point("heyoka", "Taylor", 1e-9, 1e-10, 160.0, clock=200.0),
     point("mujoco", "RK4", 8, 1e-4, 900.0, batched=False),
 ]
 
 
 def test_times_are_compared_at_equal_error_in_one_clock():
-    found = general_results.best(ROWS)
+    found = general_results.best_settings(ROWS)
     assert found["cart-pole", "single", 1e-3]["lag_envs"].ns == 50.0
     assert found["cart-pole", "single", 1e-6]["lag_envs"].ns == 80.0
     assert found["cart-pole", "single", 1e-6]["heyoka"].ns == 80.0  # its job ran at half the speed
@@ -172,7 +175,7 @@ def test_times_are_compared_at_equal_error_in_one_clock():
 def test_a_defeat_is_told_like_a_win():
     rows = [*ROWS, point("compiled", "RK4", 1, 1e-4, 10.0)]
     content = general_results.content(rows, [])
-    alone = next(c for c in content.claims if "compiled like ours, alone" in c.text)
+    alone = next(c for c in content.claims if "compiled like lag_envs, alone" in c.text)
     assert alone.holds is False and "RK4, compiled by 5.00 (cart-pole, 0.001)" in alone.evidence
     assert any(
         "RK4, compiled takes 0.2 to 0.2 times our time, and is faster in 1 of 1" in t for t in content.text
@@ -183,9 +186,9 @@ def test_a_defeat_is_told_like_a_win():
 def test_what_is_missing_is_said_and_no_error(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "heyoka", None)
     problems, truth = problem("cart-pole")
-    clock = Certified(Certified.method_of(16), 1e-12)
+    clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
     rows = list(
-        general.measured(
+        general.timed_rivals(
             problems, truth, [Heyoka("Taylor", 1e-9)], clock, "single", 1, {"system": "cart-pole"}
         )
     )
@@ -195,6 +198,6 @@ def test_what_is_missing_is_said_and_no_error(monkeypatch):
 
 def test_certificates_of_a_scene():
     system = SYSTEMS["cart-pole"]
-    attempts, bounds = general.certified(system.scene, *system.draw(20), 0.02, 16)
+    attempts, bounds = general.attempts_and_bounds(system.scene, *system.draw(20), 0.02, 16)
     assert attempts == [1] * 20 and bounds.max() < 1e-12
     assert general.shares([1, 2, -5]) == {"share": 1 / 3, "attempts": 1.5, "refused": 1}

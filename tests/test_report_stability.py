@@ -9,13 +9,13 @@ from mpmath import mp, mpf
 from lag_envs.report import bound, extremes, reference, stability, stability_maps, stability_results
 from lag_envs.report.cases import Case, ensemble, scales
 from lag_envs.report.oracle import Unresolved
-from lag_envs.report.runner import Result
+from lag_envs.report.runner import JobResult
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.tasks import cylinder_in_cylinder
 
-PROBLEM = Result("bound", "lost", "key", problem="stopped after 1 s")
+PROBLEM = JobResult("bound", "lost", "key", problem="stopped after 1 s")
 
 
 def draw(content):
@@ -32,7 +32,7 @@ def draw(content):
 
 def test_bound_is_never_broken():
     """30 comparisons of truncation with the bound, of each of θ and θ'; none closer than a factor of 10."""
-    rows = list(bound.points(6, seed=5))
+    rows = list(bound.bound_points(6, seed=5))
     assert len(rows) == 30
     for row in rows:
         assert 0.0 < 10.0 * row["theta"] < row["theta_bound"]
@@ -52,7 +52,7 @@ def test_what_is_left_out_is_the_sum_of_the_rest():
     alpha, gamma, theta, omega, h = 3.0, 0.75, 0.4, 1.1, 0.125
     drive = Coefficients(alpha, 0.0, gamma, 0.0, 0.0)
     scene, control = bound.driven(drive)
-    end = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
+    end = reference.exact_flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
     with mp.workdps(60):
         cos, sin = mp.cos_sin(mpf(theta))
         a, g, w, t = mpf(alpha), mpf(gamma), mpf(omega), mpf(h)
@@ -81,7 +81,7 @@ def test_bound_is_that_of_the_product():
 
 
 def test_cost_of_the_bound():
-    rows = list(bound.cost(6, seed=3))
+    rows = list(bound.substeps_needed(6, seed=3))
     assert all(1 <= row["needed"] <= row["chosen"] <= bound.MOST_SUBSTEPS for row in rows)
     content = bound.content(rows, [])
     assert content.claims[0].holds is None
@@ -125,7 +125,7 @@ def test_jobs_can_be_sent(section, quick):
 
 def test_verdicts():
     """All of the quick report's cases are met: accurate as expected, or refused as expected."""
-    rows = list(stability.cases(extremes.QUICK))
+    rows = list(stability.extreme_errors(extremes.QUICK))
     content = stability.content(rows, [])
     verdicts = {row[0]: row[-1] for row in content.tables[0].rows}
     assert verdicts == dict.fromkeys(extremes.QUICK, "met")
@@ -139,7 +139,7 @@ def test_verdicts():
     "name", [name for name, case in extremes.EXTREMES.items() if case.expected == extremes.REFUSED]
 )
 def test_refused(name):
-    row = extremes.measure(name)
+    row = extremes.measure_extreme(name)
     assert row["met"]
     assert row["outcome"] == extremes.REFUSED
     assert row["message"]
@@ -150,7 +150,7 @@ def test_missed_and_lost_cases_show(monkeypatch):
     wrong = extremes.EXTREMES["step of 1e-6 s"]._replace(expected=extremes.REFUSED)
     monkeypatch.setitem(extremes.EXTREMES, "step of 1e-6 s", wrong)
     monkeypatch.setitem(extremes.EXTREMES, "odd", wrong._replace(scene="Unknown"))
-    rows = list(stability.cases(["step of 1e-6 s", "odd"]))
+    rows = list(stability.extreme_errors(["step of 1e-6 s", "odd"]))
     content = stability.content(rows, [])
     assert not content.claims[1].holds
     assert "step of 1e-6 s, odd" in content.claims[1].evidence
@@ -172,23 +172,23 @@ def test_amplification_of_an_upright_bar():
 
 
 def test_heavy_damping():
-    """At γ dt = 1e4 explicit Euler and RK4 diverge, ours and the exponential stepper do not."""
-    (row,) = stability.cells("damping", "PivotedBar", 0.02, [1e4])
+    """At γ dt = 1e4 explicit Euler and RK4 diverge, lag_envs and the exponential stepper do not."""
+    (row,) = stability.map_errors("damping", "PivotedBar", 0.02, [1e4])
     errors = row["errors"]
     assert errors["explicit Euler"] == errors["RK4, 16"] == stability_results.DIVERGED
-    assert errors["ours"] < 1e-12
-    assert errors["ours"] < errors["ETD4RK"] < 1e-10
-    assert errors["ours, float32"] == stability_results.TOO_LONG
+    assert errors["lag_envs"] < 1e-12
+    assert errors["lag_envs"] < errors["ETD4RK"] < 1e-10
+    assert errors["lag_envs, float32"] == stability_results.TOO_LONG
 
 
 @pytest.mark.parametrize("name", stability_maps.STARTS)
 def test_ordinary_cells(name):
-    """In float64 ours is exact to rounding; in float32 every method is as exact as float32 can be."""
-    rows = list(stability.cells("damping", name, 0.02, [1e-3, 1e-2]))
+    """In float64 lag_envs is exact to rounding; in float32 every method is as exact as float32 can be."""
+    rows = list(stability.map_errors("damping", name, 0.02, [1e-3, 1e-2]))
     for row in rows:
         errors = row["errors"]
-        assert errors["ours"] < 2e-15
-        assert 1e-9 < errors["ours, float32"] < 1e-5
+        assert errors["lag_envs"] < 2e-15
+        assert 1e-9 < errors["lag_envs, float32"] < 1e-5
         assert errors["explicit Euler"] > errors["RK4"]
         assert errors["RK4, float32"] < 1e-5
     content = stability.content(rows, [])
@@ -200,7 +200,7 @@ def test_ordinary_cells(name):
 def test_float32_of_ordinary_steps():
     """Errors of single precision, between 1e-8 and 1e-5, over an ensemble."""
     found = [case._replace(scene=PivotedBar(track=None)) for case in ensemble("PivotedBar", 20, seed=2)]
-    ends = stability.methods(found, 0.02)["ours, float32"]
+    ends = stability.methods(found, 0.02)["lag_envs, float32"]
     worst = 0.0
     for case, end in zip(found, ends, strict=True):
         exact = case.scene.simulate(case.state, [case.control], 0.02)[-1]
@@ -216,7 +216,7 @@ def test_formulas_on_arrays_are_the_compiled_ones():
     case = Case(PivotedBar(track=None, damping=0.01), (2.0, 3.0), 3.0)
     flow = comparison("RK4", Stepped(case.scene).flow)
     compiled = Stepped(case.scene, flow).simulate(case.state, [case.control] * 16, 0.1 / 16)[-1]
-    (formula,) = stability.march(flow.fast, [case], 0.1, np.array([16]), np.float64)
+    (formula,) = stability.step_cases(flow.fast, [case], 0.1, np.array([16]), np.float64)
     assert formula == pytest.approx(compiled.tolist(), rel=1e-13)
 
 
@@ -225,7 +225,7 @@ def test_a_cell_without_a_reference_says_so(monkeypatch):
         raise Unresolved("two precisions differ")
 
     monkeypatch.setattr(stability.reference, "remembered", unresolved)
-    (row,) = stability.cells("damping", "PivotedBar", 0.02, [1.0])
+    (row,) = stability.map_errors("damping", "PivotedBar", 0.02, [1.0])
     assert set(row["errors"].values()) == {stability_results.NO_REFERENCE}
     content = stability.content([row], [])
     assert "1 without a reference" in content.claims[0].evidence
@@ -235,10 +235,10 @@ def test_a_cell_without_a_reference_says_so(monkeypatch):
 
 def test_refused_and_amplified_cells():
     """A fast start is refused; 850,000 substeps in a shell that leaves no room are accurate to rounding."""
-    (fast,) = stability.cells("speed", "PivotedBar", 1.0, [1e7])
-    (tight,) = stability.cells("arm", "CylinderInCylinder, drag", 1.0, [1e-9])
-    assert fast["errors"]["ours"] == stability_results.REFUSED
-    assert tight["errors"]["ours"] > 1e-12
+    (fast,) = stability.map_errors("speed", "PivotedBar", 1.0, [1e7])
+    (tight,) = stability.map_errors("arm", "CylinderInCylinder, drag", 1.0, [1e-9])
+    assert fast["errors"]["lag_envs"] == stability_results.REFUSED
+    assert tight["errors"]["lag_envs"] > 1e-12
     assert tight["roundings"] < extremes.ROUNDINGS
     content = stability.content([fast, tight], [])
     assert content.claims[0].holds
@@ -251,7 +251,7 @@ def test_refused_and_amplified_cells():
 
 def test_many_substeps():
     """A bar of 1e-8 m swings 5,000 times in a second: an earlier version was off by 30 times too much."""
-    row = extremes.measure("bar of 1e-8 m, 1 s")
+    row = extremes.measure_extreme("bar of 1e-8 m, 1 s")
     assert row["substeps"] > 200_000
     assert row["outcome"] == extremes.FULL and row["met"]
     assert row["roundings"] < 3.0

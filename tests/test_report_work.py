@@ -15,12 +15,13 @@ from lag_envs.report import diagrams, peers, verdicts, work_precision
 from lag_envs.report.cases import VARIANTS, ensemble
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
-from lag_envs.report.points import MODES, Point
-from lag_envs.report.rivals import Compiled, Ours
-from lag_envs.report.runner import Result
-from lag_envs.report.timing import Kernels
-from lag_envs.report.verdicts import OURS, TARGETS
-from lag_envs.report.work_precision import Series
+from lag_envs.report.points import MODES, WorkPrecisionPoint
+from lag_envs.report.rivals import CompiledMethod, ShippedStepping
+from lag_envs.report.runner import JobResult
+from lag_envs.report.timing import FlowSteps
+from lag_envs.report.verdicts import LAG_ENVS, TARGETS
+from lag_envs.report.work_precision import OrderedMethod
+from lag_envs.scenes.derivation import form_of
 
 BAR = VARIANTS["PivotedBar"].scene()
 SERIES = [
@@ -36,7 +37,7 @@ def single_steps():
 @cache
 def truths(name, count, steps=1):
     dt = work_precision.control_step(name)
-    return [work_precision.truth(case, dt, steps) for case in ensemble(name, count, seed=5)]
+    return [work_precision.exact_end(case, dt, steps) for case in ensemble(name, count, seed=5)]
 
 
 def worst(rival, name, together, steps=1, count=6):
@@ -56,61 +57,68 @@ def test_order_of_convergence(method):
     assert work_precision.measured_order(method, single_steps()) == pytest.approx(method.order, abs=0.2)
 
 
-# --- ours ---
+# --- the shipped stepping ---
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_is_exact(name, mode):
     """A regression of the shipped stepper's accuracy fails here."""
-    assert worst(Ours(Ours.METHOD, 1), name, mode == "batch", count=12) < 1e-15
+    assert worst(ShippedStepping(ShippedStepping.METHOD, 1), name, mode == "batch", count=12) < 1e-15
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_ours_is_what_simulate_does(name):
-    """The code timed as ours has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
+def test_the_shipped_stepping_is_what_simulate_does(name):
+    """What is timed has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
     dt, steps = work_precision.control_step(name), 3
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
-    found = ((Ours.METHOD, 1, dt, 3), (Ours.METHOD, 2, dt / 2, 6), (Ours.ONE_CALL, 1, steps * dt, 1))
+    found = (
+        (ShippedStepping.METHOD, 1, dt, 3),
+        (ShippedStepping.METHOD, 2, dt / 2, 6),
+        (ShippedStepping.ONE_CALL, 1, steps * dt, 1),
+    )
     for method, n, length, count in found:
         ends = [c.scene.simulate(c.state, [c.control] * count, length)[-1] for c in cases]
         for together in (False, True):
-            sample = Ours(method, n).build(Problems(cases), dt, steps, together)
+            sample = ShippedStepping(method, n).build(Problems(cases), dt, steps, together)
             assert np.array_equal(sample.end(), ends), (method, n, together)
 
 
 @pytest.mark.parametrize("quick", [True, False])
 @pytest.mark.parametrize("name", VARIANTS)
-def test_only_what_is_shipped_counts_as_ours(name, quick, monkeypatch):
+def test_only_what_is_shipped_counts_as_lag_envs(name, quick, monkeypatch):
     """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
-        found = work_precision.rivals(name, horizon, "compiled", quick)
-        assert {r.method for r in found if r.family == "ours"} <= {Ours.METHOD, Ours.ONE_CALL}
-        assert {r.family for r in found} == {"ours", "compiled"}
+        found = work_precision.variant_rivals(name, horizon, "compiled", quick)
+        assert {r.method for r in found if r.family == "lag_envs"} <= {
+            ShippedStepping.METHOD,
+            ShippedStepping.ONE_CALL,
+        }
+        assert {r.family for r in found} == {"lag_envs", "compiled"}
         assert not any("series" in r.method for r in found)
     flows = []
-    original = Kernels.__init__
+    original = FlowSteps.__init__
     monkeypatch.setattr(
-        Kernels,
+        FlowSteps,
         "__init__",
         lambda self, scene, flow=None, dt=0.02: (flows.append(flow), original(self, scene, flow, dt))[1],
     )
     case = ensemble(name, 1)[0]
-    Ours(Ours.METHOD, 1).build(Problems([case]), 0.02, 1, False)
+    ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False)
     assert flows == [None]
 
 
 def test_a_refused_step_is_no_point():
     case = ensemble("PivotedBar", 1)[0]._replace(state=(0.0, 1e12))
     with pytest.raises(ArithmeticError, match="refused"):
-        Ours(Ours.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
+        ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
 
 
 def test_kernels_refuse_other_constants():
     with pytest.raises(ValueError, match="compiled for the constants"):
-        Kernels(BAR).arguments(dataclasses.replace(BAR, damping=0.0), 0.02)
+        FlowSteps(BAR).arguments(dataclasses.replace(BAR, damping=0.0), 0.02)
 
 
 # --- rivals: no form is fast because it is broken ---
@@ -126,8 +134,8 @@ def test_kernels_refuse_other_constants():
     ],
 )  # fmt: skip
 def test_steppers_are_accurate(name, method, mode):
-    assert method in Compiled.methods(Problems(ensemble(name, 1)).equation)
-    assert worst(Compiled(method, 32), name, mode == "batch") < 1e-9
+    assert method in CompiledMethod.methods(Problems(ensemble(name, 1)).equation)
+    assert worst(CompiledMethod(method, 32), name, mode == "batch") < 1e-9
 
 
 @pytest.mark.slow
@@ -135,11 +143,12 @@ def test_steppers_are_accurate(name, method, mode):
 def test_all_steppers_are_accurate(name):
     """In every form, and with the same bits in a batch as alone."""
     some = [t.case for t in truths(name, 6)]
-    for method in Compiled.methods(Problems(some).equation):
-        order = METHODS[method.removesuffix(Compiled.CARRIED)].order
-        assert worst(Compiled(method, 256), name, False) < max(10.0 ** (-4 * order + 2), 1e-11), method
+    for method in CompiledMethod.methods(Problems(some).equation):
+        order = METHODS[method.removesuffix(CompiledMethod.CARRIED)].order
+        assert worst(CompiledMethod(method, 256), name, False) < max(10.0 ** (-4 * order + 2), 1e-11), method
         ends = [
-            Compiled(method, 2).build(Problems(some), 0.02, 3, together).end() for together in (False, True)
+            CompiledMethod(method, 2).build(Problems(some), 0.02, 3, together).end()
+            for together in (False, True)
         ]
         assert np.array_equal(*ends), method
 
@@ -147,9 +156,9 @@ def test_all_steppers_are_accurate(name):
 @pytest.mark.parametrize("name", ["PivotedBar", "CylinderInCylinder, tilt", "Incline, moving"])
 def test_held_controls_are_one_call(name):
     """Over many control steps a stepper takes substeps, or one step for several."""
-    fine, coarse = (worst(Compiled("DOP853, carried", n), name, True, 40) for n in (4, 1 / 4))
+    fine, coarse = (worst(CompiledMethod("DOP853, carried", n), name, True, 40) for n in (4, 1 / 4))
     assert fine < 1e-12 and coarse < 1e-2
-    assert Compiled("RK4", 1 / 4).substeps(40) == 10
+    assert CompiledMethod("RK4", 1 / 4).substeps(40) == 10
 
 
 @pytest.mark.parametrize("method", ["dopri5", "dop853", "lsoda", "Radau"])
@@ -215,7 +224,7 @@ def test_all_libraries_at_their_finest(package, name, mode):
 
 
 def test_a_scene_of_ones_own():
-    """Rivals take any equation: here one that is no flow of ours, with two angles that are carried along."""
+    """Rivals take any equation: here one without its own flow, with two angles that are carried along."""
 
     class Coupled(Equation):
         """Two pendulums with a spring; closed form for small swings in phase: cos(√p t)."""
@@ -241,17 +250,19 @@ def test_a_scene_of_ones_own():
             return np.array(y[:4].T)
 
     exact = 1e-6 * np.cos(np.sqrt(Some.p[0]) * 0.4)
-    found = [Compiled("RK4", 8), Compiled("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
+    found = [CompiledMethod("RK4", 8), CompiledMethod("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
     for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if _has("heyoka") else []):
         for together in (False, True):
             ends = rival.build(Some(), 0.1, 4, together).end()
             assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
     wrong = Some()
     wrong.y = Some.y * np.array([[1.0]] * 4 + [[0.0]] * 4)  # unknowns that are not carried are not used
-    assert Compiled("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(exact, rel=1e-4, abs=0)
+    assert CompiledMethod("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(
+        exact, rel=1e-4, abs=0
+    )
     with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
-        Compiled("ETD4RK", 1).build(Some(), 0.1, 4, False)
-    assert "Verlet" in Compiled.methods(Problems(ensemble("PivotedBar", 1)).equation)
+        CompiledMethod("ETD4RK", 1).build(Some(), 0.1, 4, False)
+    assert "Verlet" in CompiledMethod.methods(Problems(ensemble("PivotedBar", 1)).equation)
 
 
 def _has(package):
@@ -264,7 +275,7 @@ def _has(package):
 
 def test_a_missing_library_is_a_row(monkeypatch):
     monkeypatch.setitem(sys.modules, "heyoka", None)
-    rows = list(work_precision.points("PivotedBar", "heyoka", quick=True))
+    rows = list(work_precision.variant_points("PivotedBar", "heyoka", quick=True))
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
     table = next(t for t in work_precision.content(rows, []).tables if t.name.endswith("problems"))
     assert table.rows == [
@@ -275,7 +286,7 @@ def test_a_missing_library_is_a_row(monkeypatch):
 def test_what_takes_too_long_is_not_run(monkeypatch):
     monkeypatch.setattr(work_precision, "LIMIT", 0.0)
     monkeypatch.setattr(work_precision, "QUICK", {"one step": work_precision.QUICK["one step"]})
-    rows = list(work_precision.points("PivotedBar", "scipy", quick=True))
+    rows = list(work_precision.variant_points("PivotedBar", "scipy", quick=True))
     assert rows and all(row["problem"].startswith("not run, it would take") for row in rows)
     assert len({(row["mode"], row["method"]) for row in rows}) == len(rows)
 
@@ -301,7 +312,7 @@ def both(*args, **options):
     return [row(*args, mode=mode, **options) for mode in MODES]
 
 
-OWN = both(OURS, 100.0, 1e-16, family="ours")
+OWN = both(LAG_ENVS, 100.0, 1e-16, family="lag_envs")
 
 
 def claimed(rows, horizon="One step"):
@@ -334,15 +345,17 @@ def test_a_slower_rival_is_a_win():
     assert claimed(rows).holds is True
     assert claimed(rows).evidence == "2 of 2; the fastest rivals take 2.5 to 2.5 × our time"
     assert (
-        "To 1e-12: ours is faster in 2 of 2, where the fastest rival takes 2.5 times as long."
+        "To 1e-12: lag_envs is faster in 2 of 2, where the fastest rival takes 2.5 times as long."
         in work_precision.content(rows, []).summary.caption
     )
 
 
 def test_a_rival_that_gets_there_alone_is_a_defeat():
-    rows = both(OURS, 100.0, 1e-10, family="ours") + both("DOP853", 250.0, 1e-13)
-    assert claimed(rows).holds is False and "ours not at all" in claimed(rows).evidence
-    assert "ours does not get there and a rival does in 2" in " ".join(work_precision.content(rows, []).text)
+    rows = both(LAG_ENVS, 100.0, 1e-10, family="lag_envs") + both("DOP853", 250.0, 1e-13)
+    assert claimed(rows).holds is False and "lag_envs not at all" in claimed(rows).evidence
+    assert "lag_envs does not get there and a rival does in 2" in " ".join(
+        work_precision.content(rows, []).text
+    )
 
 
 def test_a_lost_member_reaches_nothing():
@@ -374,7 +387,7 @@ def test_sentences_count_what_the_table_has():
     for variant in VARIANTS:
         for horizon in verdicts.HORIZONS:
             place = {"variant": variant, "horizon": horizon}
-            rows += both(OURS, 100.0, 1e-16, family="ours", **place)
+            rows += both(LAG_ENVS, 100.0, 1e-16, family="lag_envs", **place)
             rows += [
                 row(
                     name, float(rng.uniform(20, 300)), float(10.0 ** rng.uniform(-16, -2)), mode=mode, **place
@@ -395,20 +408,20 @@ def assert_sentences_agree(text, columns, rows):
         horizon = paragraph.partition(".")[0].lower()
         for target, sentence in re.findall(r"To (1e-\d\d): (.*?)\.(?= To 1e|$)", paragraph):
             here = [r for r in found if r["horizon"] == horizon and r["error"] == float(target)]
-            ratios = sorted(r["other / ours"] for r in here if r["other / ours"] is not None)
+            ratios = sorted(r["other / lag_envs"] for r in here if r["other / lag_envs"] is not None)
             lost, won = [r for r in ratios if r < 1.0], [r for r in ratios if r >= 1.0]
-            for words, some in (("a rival is faster in", lost), ("ours is faster in", won)):
+            for words, some in (("a rival is faster in", lost), ("lag_envs is faster in", won)):
                 counts = re.findall(rf"{words} (\d+) of (\d+)", sentence)
                 assert counts == ([(str(len(some)), str(len(here)))] if some else [])
             if lost:
                 assert f"takes {lost[0]:.2g} (" in sentence and f"{lost[-1]:.2g} (" in sentence
             if won:
                 assert re.search(rf"takes {won[0]:.2g}( to {won[-1]:.2g})? times as long", sentence)
-            for words, ours, other in (
+            for words, own, other in (
                 ("nobody else gets there", True, False), ("nobody gets there", False, False),
-                ("ours does not get there and a rival does", False, True),
+                ("lag_envs does not get there and a rival does", False, True),
             ):  # fmt: skip
-                count = sum(bool(r["ours"]) == ours and bool(r["fastest other"]) == other for r in here)
+                count = sum(bool(r["lag_envs"]) == own and bool(r["fastest other"]) == other for r in here)
                 assert (f"{words} in {count} (" in sentence) == bool(count)
             seen += 1
     assert seen == len({(r["horizon"], r["error"]) for r in found}) > 0
@@ -433,24 +446,27 @@ def test_committed_claims_follow_from_the_table():
     rows = [dict(zip(table["columns"], line, strict=True)) for line in table["rows"]]
     for horizon, target in verdicts.CLAIMED.items():
         here = [r for r in rows if (r["horizon"], r["error"]) == (horizon, target)]
-        lost = [r for r in here if r["fastest other"] and (r["other / ours"] or 0.0) < 1.0]
+        lost = [r for r in here if r["fastest other"] and (r["other / lag_envs"] or 0.0) < 1.0]
         claim = next(c for c in section["claims"] if c["text"].startswith(f"{horizon.capitalize()}: nobody"))
         assert claim["holds"] is not bool(lost)
         assert all(r["fastest other"] in claim["evidence"] for r in lost)
 
 
-def test_only_what_is_shipped_is_committed_as_ours():
+def test_only_what_is_shipped_is_committed_as_lag_envs():
     table = next(t for t in committed()["tables"] if t["name"].endswith("targets"))
-    ours = {line[table["columns"].index("ours")] for line in table["rows"]} - {None}
-    steps = {f"{Ours.METHOD}, {words}" for words in ("2 substeps", *(f"a step for {n}" for n in (2, 4, 8)))}
-    assert OURS in ours <= {Ours.METHOD, Ours.ONE_CALL} | steps
+    methods = {line[table["columns"].index("lag_envs")] for line in table["rows"]} - {None}
+    steps = {
+        f"{ShippedStepping.METHOD}, {words}"
+        for words in ("2 substeps", *(f"a step for {n}" for n in (2, 4, 8)))
+    }
+    assert LAG_ENVS in methods <= {ShippedStepping.METHOD, ShippedStepping.ONE_CALL} | steps
 
 
 def test_jobs_are_brought_to_one_scale():
     """A rival whose job ran on a machine of twice the speed is not counted as twice as fast."""
     slow = both("Taylor", 300.0, 1e-13, family="heyoka", clock=200.0)
     ns = {p.name: p.ns for p in verdicts.gathered(OWN + slow)}
-    assert ns == {OURS: 100.0, "heyoka Taylor": 150.0}
+    assert ns == {LAG_ENVS: 100.0, "heyoka Taylor": 150.0}
 
 
 def test_without_a_batch_it_is_one_after_the_other():
@@ -469,7 +485,7 @@ def test_errors_below_amplified_rounding_are_none():
 
 def test_a_lost_job_is_a_row_and_claims_nothing():
     """Without rows every claim is open; the problem is stated."""
-    lost = Result("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
+    lost = JobResult("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
     content = work_precision.content([], [lost])
     assert all(claim.holds is None for claim in content.claims)
     assert any("stopped after 120 s" in row for table in content.tables for row in table.rows)
@@ -477,16 +493,18 @@ def test_a_lost_job_is_a_row_and_claims_nothing():
 
 def test_the_picture_has_the_fastest_form_of_each():
     def point(method, ns, error):
-        return Point("PivotedBar", "one step", "single", "compiled", method, 1, error, error, [error], ns)
+        return WorkPrecisionPoint(
+            "PivotedBar", "one step", "single", "compiled", method, 1, error, error, [error], ns
+        )
 
     points = [point("RK4", 50.0, 1e-9), point("RK4, carried", 20.0, 1e-8), point("RK4, carried", 60.0, 1e-8)]
     assert [(p.method, p.ns) for p in diagrams.curves(points)["RK4"]] == [
         ("RK4, carried", 20.0),
         ("RK4", 50.0),
     ]
-    figure = diagrams.draw("PivotedBar", points, {})
+    figure = diagrams.draw_variant("PivotedBar", points, {})
     assert len(figure.axes) == 2
-    known = {*diagrams.STYLES, *diagrams.OURS}
+    known = {*diagrams.STYLES, *diagrams.OWN_STYLES}
     assert {
         f"{verdicts.LIBRARIES[p]} {m}".partition(",")[0] for p, c in peers.PEERS.items() for m in c.settings
     } <= known
@@ -508,6 +526,6 @@ def test_targets_are_compared_once():
 
 
 def test_series_are_only_measured_for_their_order():
-    assert all(isinstance(s, Series) for s in work_precision.series(BAR))
-    flow = BAR._form.flow(0.02)
+    assert all(isinstance(s, OrderedMethod) for s in work_precision.series(BAR))
+    flow = form_of(BAR).flow(0.02)
     assert comparison("RK4", flow, True) is comparison("RK4", flow, True)

@@ -10,11 +10,11 @@ import pytest
 from covering import covering
 
 from agents import behaviour, figures, measure, report, results
-from agents.analysis import learning_curve, level, summarise_env, summarise_learners, times
+from agents.analysis import learning_curve, level, summarise_env, summarise_learners, times_to_levels
 from agents.run import fresh_seeds
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN, Condition
-from lag_envs.evaluation.rollout import Episodes, Rollout, play, record
+from lag_envs.evaluation.rollout import Episodes, Rollout, play, record_rollout
 from lag_envs.generated import replaced
 from lag_envs.scores import KnownReturns
 from lag_envs.tasks import TASKS, incline, pivoted_bar
@@ -110,12 +110,12 @@ def test_summary_of_an_environment():
 def test_when_learners_reach_a_score():
     """Half of the seeds or more have to reach a level for a median; without a scale there are no levels."""
     slow, quick = ([(0, 0.1, 0.0), (500 * k, 3.0 * k, 0.98)] for k in (2, 1))
-    assert times([slow, quick, quick[:1]]) == {
+    assert times_to_levels([slow, quick, quick[:1]]) == {
         "0.9": {"seeds": 2, "steps": 1000.0, "seconds": 6.0},
         "0.97": {"seeds": 2, "steps": 1000.0, "seconds": 6.0},
         "0.99": {"seeds": 0, "steps": None, "seconds": None},
     }
-    text = report.page(invented())
+    text = report.agents_page(invented())
     assert "| ppo, 5 seeds of 1,000 steps | 5 of 5: 1,000 steps, 6 s | 0 of 5 | 0 of 5 |" in text
     assert "reached" not in invented()["envs"][pivoted_bar.Balance.id]["agents"]["ppo"]
 
@@ -176,7 +176,7 @@ def test_command_measures_and_resumes(command, tmp_path, monkeypatch):
     expected = [play(ENV, Constant(0.1 * k), fresh_seeds(4)).mean() for k in (0, 1, 0)]
     np.testing.assert_allclose(agents["ppo"]["conditions"][NOMINAL]["return"], np.mean(expected), rtol=1e-4)
     assert agents["zero"]["conditions"]["gravity +20 %"] != agents["zero"]["conditions"][NOMINAL]
-    assert (tmp_path / results.PAGE).read_text() == report.page(data)
+    assert (tmp_path / results.PAGE).read_text() == report.agents_page(data)
     assert "optimal: not computed" in (tmp_path / results.PAGE).read_text()
 
     # Nothing is measured twice, but a new policy is.
@@ -257,7 +257,7 @@ def test_command_says_what_is_wrong(command, tmp_path):
     ):
         status, output = command(*arguments)
         assert status == 2 and message in output, output
-    results.write(tmp_path / results.SUMMARY, "{}")
+    results.write_file(tmp_path / results.SUMMARY, "{}")
     for arguments in (["--redraw"], ["--envs", ENV]):
         status, output = command(*arguments)
         assert status == 2 and "cannot be read" in output
@@ -270,17 +270,17 @@ def test_command_says_what_is_wrong(command, tmp_path):
 
 
 def test_page_and_figures_of_any_results(tmp_path):
-    data = results.rounded(invented())
-    results.write(tmp_path / results.SUMMARY, results.to_json(data))
+    data = results.rounded_data(invented())
+    results.write_file(tmp_path / results.SUMMARY, results.results_json(data))
     assert summary(tmp_path) == data
     stale = tmp_path / results.PICTURES / "agents-stale.png"
-    results.write(stale, b"of an agent that is gone")
+    results.write_file(stale, b"of an agent that is gone")
     assert results.main(["--redraw", "--output", str(tmp_path)]) == 0
     assert not stale.exists()
     text = (tmp_path / results.PAGE).read_text()
-    assert text == report.page(data) and "nan" not in text
+    assert text == report.agents_page(data) and "nan" not in text
     assert "| a\\|b | 9.90 ± 0.20 | 0.990 (0.950, 1.030) |" in text
-    # What a learner had stands beside whatever it is said to reach.
+    # Scores are shown with the seeds and steps that a learner was given.
     assert "| ppo, 5 seeds of 1,000 steps | " in text and "| td3, 1 seed of 1,000 steps | " in text
     assert re.search(r"\| sac\+ \| .* \| 3 \| 1,000 \|", text)
     assert "Left out:" in text and "sac+" in text
@@ -358,10 +358,10 @@ def test_fewer_episodes_are_told():
 
 
 def test_how_agents_act_is_what_is_committed():
-    """One learner and one controller of it, played anew."""
+    """A learner and a controller, played again."""
     kept = json.loads(behaviour.OUTPUT.read_text())
     assert set(kept["envs"]) <= set(TASKS) and kept["episodes"] == behaviour.EPISODES
-    found = behaviour.measured(ENV)
+    found = behaviour.behaviour_of(ENV)
     assert set(found) == set(kept["envs"][ENV]) == {"fast_ppo", "ppo", "switching line"}
     for name, measures in found.items():
         for what, values in measures.items():
@@ -371,7 +371,7 @@ def test_how_agents_act_is_what_is_committed():
 
 def test_how_agents_act_by_hand():
     """Constant brakes: nothing has to be learnt, and time and speed have closed forms."""
-    played = record(Rollout(ENV, Constant(1.0), fresh_seeds(50)))
+    played = record_rollout(Rollout(ENV, Constant(1.0), fresh_seeds(50)))
     measured = behaviour.measures(played)
     x, v = played.states[0].T
     rate = 6.0 * 2.0 / 3.0  # a solid cylinder of 1 kg
@@ -413,15 +413,17 @@ def test_notes_are_about_environments_that_exist_and_hold_no_numbers():
     for task in TASKS.values():
         text = task.note
         assert text and not re.search(r"\d", text.replace("TD3", "")), text
-    assert "It is best." in report.page(invented(), {"PivotedBar-v0": "It is best."})
+    assert "It is best." in report.agents_page(invented(), {"PivotedBar-v0": "It is best."})
 
 
 def test_committed_page_is_made_from_the_committed_results():
     data = summary(ROOT)
     training = (ROOT / results.TRAINING).read_text(encoding="utf-8")
-    assert training == replaced(training, "agents", report.summary(data)), "python -m agents.results --redraw"
+    assert training == replaced(training, "agents", report.summary_table(data)), (
+        "python -m agents.results --redraw"
+    )
     text = (ROOT / results.PAGE).read_text(encoding="utf-8")
-    assert text == report.page(data), "python -m agents.results --redraw"
+    assert text == report.agents_page(data), "python -m agents.results --redraw"
     for line in text.splitlines():
         if "](images/" in line:
             file = ROOT / "docs" / line.split("](")[1].rstrip(")")

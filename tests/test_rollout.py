@@ -6,7 +6,15 @@ from covering import covering
 from rollouts import one_by_one
 
 from lag_envs.controllers import Constant, build, controllers, make_controller
-from lag_envs.evaluation.rollout import Outcome, PolicyError, Rollout, arrivals, observation_std, play, record
+from lag_envs.evaluation.rollout import (
+    Outcome,
+    PolicyError,
+    Rollout,
+    arrivals,
+    observation_std,
+    play,
+    record_rollout,
+)
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
 ENV = incline.Brake.id
@@ -101,7 +109,7 @@ def test_arrivals_by_hand():
 def test_recorded_episodes_hold_together():
     rollout = Rollout(ENV, make_controller(ENV, "switching line"), range(20))
     outcome, taken = Outcome(rollout), []
-    played = record(rollout, outcome, taken.append)
+    played = record_rollout(rollout, outcome, taken.append)
     steps = played.steps
     assert len(taken) == steps.max() > steps.min() and np.array_equal(outcome.steps, steps)
     assert played.states.shape == (steps.max() + 1, 20, 2) and played.actions.shape == (steps.max(), 20, 1)

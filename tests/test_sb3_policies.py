@@ -22,7 +22,7 @@ def make(kind, **options):
     return kind(*SPACES, lambda _: 1e-3, net_arch=[16, 16], **options)
 
 
-def ours(name, **options):
+def own_policy(name, **options):
     return make(getattr(sb3_policies, name), **options)
 
 
@@ -33,7 +33,7 @@ def observations():
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_noise_is_kept_and_then_drawn_anew(name, observations):
-    policy = ours(name, noise_steps=3)
+    policy = own_policy(name, noise_steps=3)
     with torch.no_grad():
         taken = [policy._predict(observations) for _ in range(7)]
     same = [torch.equal(a, b) for a, b in pairwise(taken)]
@@ -46,19 +46,19 @@ def test_noise_is_kept_and_then_drawn_anew(name, observations):
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_without_noise_it_is_the_librarys_policy(name, observations):
-    policy = ours(name, first_layer_scale=1.0)
-    theirs = make(POLICIES[name], activation_fn=nn.Tanh)
+    policy = own_policy(name, first_layer_scale=1.0)
+    original = make(POLICIES[name], activation_fn=nn.Tanh)
     with torch.no_grad():
-        expected = theirs._predict(observations, True)
+        expected = original._predict(observations, True)
         torch.testing.assert_close(policy._predict(observations, True), expected, rtol=0.0, atol=0.0)
-    scaled = ours(name, first_layer_scale=3.0)
+    scaled = own_policy(name, first_layer_scale=3.0)
     with torch.no_grad():
-        wide = theirs._predict(3.0 * observations, True)
+        wide = original._predict(3.0 * observations, True)
         inputs = torch.cat([observations, torch.full((4, 2), 0.3)], dim=1)
         tripled = torch.cat([3.0 * observations, torch.full((4, 2), 0.3)], dim=1)
         # Biases stay, and so do a critic's weights for actions.
         torch.testing.assert_close(scaled._predict(observations, True), wide)
-        for mine, other in zip(scaled.critic.q_networks, theirs.critic.q_networks, strict=True):
+        for mine, other in zip(scaled.critic.q_networks, original.critic.q_networks, strict=True):
             torch.testing.assert_close(mine(inputs), other(tripled))
         for mine, target in zip(scaled.critic.parameters(), scaled.critic_target.parameters(), strict=True):
             assert torch.equal(mine, target)
@@ -67,7 +67,7 @@ def test_without_noise_it_is_the_librarys_policy(name, observations):
 @pytest.mark.parametrize("name", ["SAC", "TQC"])
 def test_what_is_drawn_is_what_is_learnt_from(name):
     """Actions have the distribution whose likelihood the learner computes: the network's mean and spread."""
-    policy = ours(name, noise_steps=1)
+    policy = own_policy(name, noise_steps=1)
     many = torch.full((20_000, 5), 0.2)
     with torch.no_grad():
         mean, log_std, _ = policy.actor.get_action_dist_params(many[:1])
@@ -77,12 +77,12 @@ def test_what_is_drawn_is_what_is_learnt_from(name):
 
 
 def test_noise_of_td3():
-    policy = ours("TD3", noise=0.2, noise_steps=1)
+    policy = own_policy("TD3", noise=0.2, noise_steps=1)
     many = torch.full((20_000, 5), 0.2)
     with torch.no_grad():
         centre, drawn = policy._predict(many, True), policy._predict(many)
         assert torch.all(((drawn - centre).std(0) - 0.2).abs() < 0.01)
-        assert ours("TD3", noise=5.0)._predict(many).abs().max() == 1.0
+        assert own_policy("TD3", noise=5.0)._predict(many).abs().max() == 1.0
 
 
 @pytest.mark.parametrize(
@@ -96,4 +96,4 @@ def test_noise_of_td3():
 )
 def test_bad_numbers(name, options, message):
     with pytest.raises(ValueError, match=message):
-        ours(name, **options)
+        own_policy(name, **options)

@@ -6,6 +6,7 @@ import pytest
 from lag_envs.scenes.acrobot import Acrobot
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
 
@@ -49,7 +50,7 @@ def answers(engine, q, v, force):
 
 def compare(scene, engine, force_of, turn=None, seed=0):
     """Compare at random states; ``turn`` maps the scene's velocities to MuJoCo's."""
-    n = len(scene._layout.free)
+    n = len(layout_of(scene).free)
     turn = np.eye(n) if turn is None else turn
     generator = np.random.default_rng(seed)
     for _ in range(50):

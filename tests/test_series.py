@@ -21,27 +21,27 @@ from covering import every, slow
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System
 
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import Chain, StepRefused
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import compiling, driver, general, machine
+from lag_envs.stepping.certificate import SMALLEST_SIZE, Certificate
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.lowering import ELAPSED
-from lag_envs.stepping.machine import Layout, compile_attempt
+from lag_envs.stepping.machine import LaneLayout, compile_attempt
 from lag_envs.stepping.series import (
     LARGEST_ORDER,
     SMALLEST_ORDER,
-    SMALLEST_SIZE,
     TOLERANCE,
     TRIES,
-    Certificate,
-    Lane,
-    Plain,
     Series,
+    StepProgress,
 )
-from lag_envs.stepping.tracing import evaluate
+from lag_envs.stepping.target import Plain
+from lag_envs.stepping.tracing import evaluate_operations
 
 NAMES = [system.name for system in SYSTEMS]
 FLOATS = types.SimpleNamespace(
@@ -86,7 +86,7 @@ def sums(series, first):
 def stepper(scene: Scene, fused: bool = True):
     """Return the scene's stepper, its constants and its code."""
     found = SeriesStepper(scene.mechanics)
-    constants = found.constants({name: getattr(scene, name) for name in scene._numbers()})
+    constants = found.constants(parameter_values(scene))
     zero = frozenset(name for name, value in constants.items() if value == 0.0)
     return found, constants, found.code(zero, fused)
 
@@ -115,7 +115,7 @@ def compiled(record, lanes=1, fused=True):
 def attempts(system, cases, order, tolerance):
     """Return for each case (state, control, h) the certified length, 0 if none, and bounds on the tails."""
     record = record_of(system)
-    layout, n = Layout(record), record.size
+    layout, n = LaneLayout(record), record.size
     run, results = compiled(record), []
     for state, control, h in cases:
         rows = np.zeros(layout.rows)
@@ -349,7 +349,7 @@ def test_operations_grow_no_faster_than_the_cube_of_the_number_of_links():
 def rows_of(system, cases):
     """Return a block of rows: for each case inputs, places and velocities."""
     record = record_of(system)
-    layout, n = Layout(record), record.size
+    layout, n = LaneLayout(record), record.size
     rows = np.zeros((2 * layout.bounds + 1, BLOCK))
     for lane, (state, control) in enumerate(cases):
         given, q, v = inputs(system, state, control)
@@ -362,7 +362,7 @@ def rows_of(system, cases):
 def block_steps(system, cases, dt, order, fused=True, **options):
     """Return places, velocities and the status of each lane after a control step of a block."""
     record = record_of(system, fused)
-    layout, rows = Layout(record), rows_of(system, cases)
+    layout, rows = LaneLayout(record), rows_of(system, cases)
     advance = compile_advance_block(record, fused=fused, **options)
     refused = advance(rows.reshape(-1), 0, len(cases), dt, order)
     assert refused == (rows[layout.status, : len(cases)] < 0).sum()
@@ -372,7 +372,7 @@ def block_steps(system, cases, dt, order, fused=True, **options):
 def single_steps(system, cases, dt, order, fused=True):
     """Return the same from the function for a single lane."""
     record = record_of(system, fused)
-    layout, rows = Layout(record), rows_of(system, cases)
+    layout, rows = LaneLayout(record), rows_of(system, cases)
     advance, results = compile_advance(record, fused=fused), []
     for lane in range(len(cases)):
         one = np.zeros(layout.rows)
@@ -400,7 +400,7 @@ def in_python(name, source, *helpers, **constants):
 
     def block(operations, inputs, outputs):
         def run(*values):
-            known = evaluate(operations, dict(zip(inputs, values, strict=True)))
+            known = evaluate_operations(operations, dict(zip(inputs, values, strict=True)))
             return tuple(known[name] for name in outputs)
 
         return run
@@ -422,12 +422,12 @@ def in_python(name, source, *helpers, **constants):
 
 def advance_in_python(record, tolerance=TOLERANCE, fused=False):
     """Replace `compile_advance`: the driver's own code on `Plain`."""
-    series, layout, n = Series(record), Layout(record), record.size
+    series, layout, n = Series(record), LaneLayout(record), record.size
 
     def attempt(rows, at, dt, order, tolerance):
         given = {name: rows[row] for name, row in layout.inputs.items()}
         q, v = (list(rows[first : first + n]) for first in (layout.q, layout.v))
-        lane = Lane(q, v, *rows[layout.status : layout.bounds])
+        lane = StepProgress(q, v, *rows[layout.status : layout.bounds])
         after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
         rows[layout.q : layout.bounds] = [*after.q, *after.v, after.status, after.left, after.wish]
         for row, bound in enumerate(bounds, layout.bounds):
@@ -660,7 +660,7 @@ def test_error_of_many_control_steps(system, dt, order):
 @pytest.mark.parametrize("system", [SYSTEMS[1], SYSTEMS[5], SYSTEMS[7]], ids=lambda system: system.name)
 def test_jacobian_is_that_of_exact_steps(system):
     state, control = system.draw(np.random.default_rng(16), 0.5)
-    numbers = {name: getattr(system.scene, name) for name in system.scene._numbers()}
+    numbers = parameter_values(system.scene)
     tangent = stepper(system.scene)[0].tangent(numbers)
     found, refused = tangent.jacobian(np.array([state]), np.array([control]), 0.02, 16)
     expected = exact_slopes(system, state, control, 0.02)
@@ -740,7 +740,7 @@ def test_bits_do_not_depend_on_fused_instructions():
     engine.finalize_object()
     kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_int64, ctypes.c_double)
     attempt = kind(engine.get_function_address("attempt"))
-    layout, rows = Layout(record_of(system)), rows_of(system, [system.draw(np.random.default_rng(14))])
+    layout, rows = LaneLayout(record_of(system)), rows_of(system, [system.draw(np.random.default_rng(14))])
     results = []
     for run in (attempt, compiled(record_of(system))):
         one = np.zeros(layout.rows)

@@ -11,7 +11,7 @@ from test_ppo import learnt
 from trainings import go
 
 from agents import cloning, learners, shac, train
-from agents.learners import hyperparameters, load_policy
+from agents.learners import load_policy, zoo_hyperparameters
 from agents.run import RESULT, Run, UserError, fresh_seeds
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import score
@@ -34,7 +34,7 @@ def short(monkeypatch):
 
 
 def make_run(folder, algo, seed=3):
-    return Run(Path(folder), FREE, algo, seed, 768, hyperparameters(algo, FREE) | SHORT[algo])
+    return Run(Path(folder), FREE, algo, seed, 768, zoo_hyperparameters(algo, FREE) | SHORT[algo])
 
 
 @each_learner
@@ -57,7 +57,7 @@ def test_a_seed_decides_everything_with_interruptions_or_without(algo, tmp_path)
 def test_gradients_are_slopes_of_what_is_earned(env_id, share):
     """Against differences of one action: through policy, guard, critic, and ends of episodes."""
     steps, n, gamma, first = 12, 4, 0.97, 3
-    settings = hyperparameters("shac", env_id) | {
+    settings = zoo_hyperparameters("shac", env_id) | {
         "n_envs": n, "n_steps": steps, "critic": [8], "gamma": gamma, "episode_share": share,
         "max_slope": 1e9,
     }  # fmt: skip
@@ -86,7 +86,7 @@ def test_gradients_are_slopes_of_what_is_earned(env_id, share):
 
 def test_it_swings_the_free_bar_up():
     """In about a second of training; back-propagation through time without bounds stays below .6."""
-    hyper = hyperparameters("shac", FREE) | {"n_timesteps": 4e5}
+    hyper = zoo_hyperparameters("shac", FREE) | {"n_timesteps": 4e5}
     learner = shac.Learner(FREE, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:
         learner.iterate()
@@ -96,7 +96,7 @@ def test_it_swings_the_free_bar_up():
 @pytest.mark.slow
 def test_it_keeps_the_bar_up_on_a_track():
     """For ten seconds: a policy that drifts reaches the track's end, drops the bar, and stays below .9."""
-    hyper = hyperparameters("shac", TRACK)
+    hyper = zoo_hyperparameters("shac", TRACK)
     learner = shac.Learner(TRACK, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:
         learner.iterate()
@@ -120,7 +120,7 @@ def test_it_keeps_the_bar_up_on_a_track():
 def test_mistakes_are_named(algo, env_id, changes, message):
     module = {"shac": shac, "cloning": cloning}[algo]
     with pytest.raises(UserError, match=message):
-        module.Learner(env_id, module.Settings.of(hyperparameters(algo, env_id) | changes), 0, 1000)
+        module.Learner(env_id, module.Settings.of(zoo_hyperparameters(algo, env_id) | changes), 0, 1000)
 
 
 def test_commands_know_them(tmp_path, capsys):

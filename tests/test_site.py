@@ -21,8 +21,8 @@ from toy_pendulum import Swing
 
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.site import build as site
-from lag_envs.leaderboard.site.build import build, render
-from lag_envs.leaderboard.site.scenery import Scenery, picture
+from lag_envs.leaderboard.site.build import render, write_page
+from lag_envs.leaderboard.site.scenery import Scenery, picture_data
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.picture import Picture
@@ -71,7 +71,7 @@ def hostile():
 @pytest.fixture(scope="module")
 def folder(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("site")
-    build(data, out)
+    write_page(data, out)
     return out
 
 
@@ -330,7 +330,7 @@ def test_episodes_are_written_as_columns():
         found, n, units = (
             Scenery(env_id).episode(replay),
             len(replay["states"]),
-            picture(Picture(task))["units"],
+            picture_data(Picture(task))["units"],
         )
         assert found["steps"] == n - 1 and found["label"] == "median"
         states = np.stack([unpacked(c, n, found["unit"]) for c in found["states"]], -1)
@@ -362,28 +362,28 @@ def files_of(folder):
 
 
 def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path):
-    build(data, tmp_path)
+    write_page(data, tmp_path)
     (tmp_path / "CNAME").write_text("example.org")
     first = files_of(tmp_path)
-    build(data, tmp_path)
+    write_page(data, tmp_path)
     assert files_of(tmp_path).keys() == first.keys()
     assert all(t == first[n] for n, t in files_of(tmp_path).items() if n.startswith("assets/"))
-    build({**data, "environments": data["environments"][:1]}, tmp_path)
+    write_page({**data, "environments": data["environments"][:1]}, tmp_path)
     left = files_of(tmp_path)
     assert f"{incline.Brake.id}.html" not in left and "CNAME" in left
     assert sum(name.startswith("assets/") for name in left) == 5 + len(board_pages.AGENTS)
 
 
-def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):
+def test_a_folder_with_other_files_is_refused(data, tmp_path):
     (tmp_path / "index.html").write_text("mine")
     with pytest.raises(FileExistsError, match="not a leaderboard's"):
-        build(data, tmp_path)
+        write_page(data, tmp_path)
     (tmp_path / "site.json").write_text("{")
     with pytest.raises(FileExistsError, match="cannot be read"):
-        build(data, tmp_path)
+        write_page(data, tmp_path)
     (tmp_path / "site.json").write_text('{"files": ["../precious.html", "index.html"]}')
     (tmp_path.parent / "precious.html").write_text("mine")
-    build(data, tmp_path)
+    write_page(data, tmp_path)
     assert (tmp_path.parent / "precious.html").exists()
 
 
@@ -393,7 +393,7 @@ def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
     real = os.replace
     for moment in itertools.count():
         out = tmp_path / str(moment)
-        build(small, out)
+        write_page(small, out)
         left = moment
 
         def replace(*names):
@@ -405,7 +405,7 @@ def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
 
         monkeypatch.setattr(os, "replace", replace)
         try:
-            build(other, out)
+            write_page(other, out)
             finished = True
         except KeyboardInterrupt:
             finished = False
@@ -415,7 +415,7 @@ def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
             assert text.endswith("</html>")
             for name in re.findall(r"assets/[\w-]+\.(?:js|css)", text):
                 assert (out / name).exists(), (moment, page.name, name)
-        build(other, out)
+        write_page(other, out)
         assert not list(out.rglob("*.part"))
         assert len(list(out.rglob("*.js"))) == 2 + 2 * 3, "what a killed build left is removed by the next"
         if finished:
@@ -476,7 +476,7 @@ def test_overview(open_page, data):
 
 
 def test_scenes_of_ones_own_are_drawn(own, open_page, tmp_path):
-    build(own, tmp_path)
+    write_page(own, tmp_path)
     for name, drawn in (("BallOnBeam-v0", True), ("Reach-v0", True), ("Shapeless-v0", False)):
         page = open_page(name, root=tmp_path.as_uri())
         assert (colours(page, ".scene") > 20) == drawn
@@ -511,7 +511,7 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
     for env_id, kind in TASKS.items():
         task = kind()
         shown, wide = Picture(task), Picture(task).view
-        described, size = json.dumps(picture(shown)), max(wide.right - wide.left, wide.top - wide.bottom)
+        described, size = json.dumps(picture_data(shown)), max(wide.right - wide.left, wide.top - wide.bottom)
         for _ in range(3):
             state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.half_widths).tolist()
             controls = task.wanted(rng.uniform(-1, 1, (1, task.formulas.actions)))[0]
@@ -677,7 +677,7 @@ def test_pictures_of_the_ranking(open_page):
 
 
 def test_hostile_names_stay_names(open_page, hostile, tmp_path):
-    build(hostile, tmp_path)
+    write_page(hostile, tmp_path)
     page = open_page(root=tmp_path.as_uri())
     names = page.evaluate("[...document.querySelectorAll('.ranking .name bdi')].map(e => e.textContent)")
     wanted = [clean(name) for name in HOSTILE]
@@ -721,7 +721,7 @@ WIDTHS = (320, 375, 480, 640, 832, 833, 900, 992, 1024, 1280, 1408, 1409, 1440, 
 
 def test_ranking_fits_at_every_width(open_page, tmp_path):
     names = ["An agent whose authors gave it a name that goes on and on " * 3, "N" * 120]
-    build(board_pages.data(agents=[(name, "controller", 0.5) for name in names]), tmp_path)
+    write_page(board_pages.data(agents=[(name, "controller", 0.5) for name in names]), tmp_path)
     for root in (None, tmp_path.as_uri()):
         page = open_page(root=root)
         for width in WIDTHS:
@@ -775,7 +775,7 @@ def test_axe_finds_nothing_serious(open_page, served, name, scheme):
 def test_axe_finds_nothing_serious_on_the_whole_board(browser, tmp_path):
     """On every page; for an environment's agents, whose pages are made alike, only on the first one's."""
     board = Path(__file__).parents[1] / "leaderboard"
-    build(board_data(Board(board)), tmp_path)
+    write_page(board_data(Board(board)), tmp_path)
     pages = {}
     for file in sorted(tmp_path.glob("*.html")):
         of = next((env_id for env_id in TASKS if file.stem.startswith(f"{env_id}-")), file.stem)
@@ -813,7 +813,7 @@ def test_page_is_light_before_anything_is_played(served, browser, name):
 @pytest.mark.slow
 def test_so_is_every_page_of_the_board(browser, tmp_path):
     """The longest episodes, with up to thousands of steps."""
-    build(board_data(Board(Path(__file__).parents[1] / "leaderboard")), tmp_path)
+    write_page(board_data(Board(Path(__file__).parents[1] / "leaderboard")), tmp_path)
     for env_id in TASKS:
         assert loaded(browser, (tmp_path / f"{env_id}.html").as_uri())[0] < 300_000, env_id
 

@@ -26,7 +26,7 @@ CASES = [
 
 
 def go_on(env: gym.Env, steps: int, seed: int = 0) -> list:
-    """Return everything observable in so many steps, resets included."""
+    """Return everything observable in this many steps, resets included."""
     rng, seen = np.random.default_rng(seed), []
     for _ in range(steps):
         action = (

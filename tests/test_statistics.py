@@ -21,7 +21,7 @@ from lag_envs.evaluation.statistics import (
     pooled_iqm,
     profile,
     redraw,
-    rounded,
+    rounded_data,
     wilson,
     without_luck,
 )
@@ -86,7 +86,7 @@ def test_estimate():
 
 
 def test_numbers_are_rounded_wherever_they_stand():
-    assert rounded({"a": [1.23456789, (2, None)], "b": True}) == {"a": [1.23457, [2, None]], "b": True}
+    assert rounded_data({"a": [1.23456789, (2, None)], "b": True}) == {"a": [1.23457, [2, None]], "b": True}
 
 
 # --- luck ---
@@ -170,12 +170,12 @@ def test_intervals_and_profile_are_those_of_rliable():
     x, y = rng.normal(0.9, 0.1, 10), rng.normal(0.85, 0.1, 8)
     state = np.random.RandomState(0)
 
-    def theirs(data, statistic):
+    def by_rliable(data, statistic):
         found = library.get_interval_estimates({"a": data}, statistic, reps=2000, random_state=state)
         return found[1]["a"].ravel()
 
-    assert interval(iqm, x) == pytest.approx(theirs(x[:, None], metrics.aggregate_iqm), abs=0.01)
-    expected = theirs((x[:, None], y[:, None]), metrics.probability_of_improvement)
+    assert interval(iqm, x) == pytest.approx(by_rliable(x[:, None], metrics.aggregate_iqm), abs=0.01)
+    expected = by_rliable((x[:, None], y[:, None]), metrics.probability_of_improvement)
     assert interval(improvement, x, y) == pytest.approx(expected, abs=0.04)
     shares, _ = library.create_performance_profile({"a": x[:, None]}, THRESHOLDS, reps=2)
     np.testing.assert_allclose(profile(x), shares["a"])

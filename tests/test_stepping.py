@@ -31,6 +31,7 @@ from lag_envs.report.bound import driven
 from lag_envs.report.closed_forms import elliptic, linear
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
+from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.stepping.slope import FixedSlope, TurningSlope
@@ -63,15 +64,15 @@ def coefficients(scene):
 
 def operations(scene):
     """Return the number of operations of an ordinary step."""
-    zero = frozenset(name for name, value in scene._constants().items() if value == 0.0)
-    return scene._form.stepper(0.02, zero).operations
+    zero = frozenset(name for name, value in motion_constants_of(scene).items() if value == 0.0)
+    return form_of(scene).stepper(0.02, zero).operations
 
 
 def advance_of(scene, dt):
     """Return the scene's compiled step, and its arguments after state, control and step."""
-    numbers = scene._constants()
-    code = scene._form.stepper(dt, frozenset(name for name, value in numbers.items() if value == 0.0))
-    return code.compile(), [scene._form.largest_majorant(dt), *(v for v in numbers.values() if v)]
+    numbers = motion_constants_of(scene)
+    code = form_of(scene).stepper(dt, frozenset(name for name, value in numbers.items() if value == 0.0))
+    return code.compile(), [form_of(scene).largest_majorant(dt), *(v for v in numbers.values() if v)]
 
 
 # --- the series -----------------------------------------------------------------------------------
@@ -214,13 +215,13 @@ PENDULUMS = {
 def test_one_substep_leaves_out_no_more_than_the_tolerance(name, dt):
     """Walk the speed: one substep up to the certified speed, within 1e-12 rad/s; several within the size."""
     scene = PENDULUMS[name]
-    tolerance, place = pendulum.TOLERANCE, scene._form.angle + 1
+    tolerance, place = pendulum.TOLERANCE, form_of(scene).angle + 1
     state = np.linspace(0.3, 1.0, len(scene.state_names))
     advance, numbers = advance_of(scene, dt)
     reached = set()
     for u in (0.0, 5.0, 200.0):
-        certified = scene._form.certified_speed(state, [u], dt, scene._constants())
-        field = math.hypot(*scene._form.coefficients(state, [u], scene._constants())[:2])
+        certified = form_of(scene).certified_speed(state, [u], dt, motion_constants_of(scene))
+        field = math.hypot(*form_of(scene).coefficients(state, [u], motion_constants_of(scene))[:2])
         near = max(certified, 0.0)
         walk = {near, near * (1.0 + 1e-12), near + 0.01, 1.1 * near, *np.linspace(0.0, 40.0, 300)}
         walk |= {*np.linspace(0.5 * near, 2.0 * near, 100)}
@@ -233,7 +234,7 @@ def test_one_substep_leaves_out_no_more_than_the_tolerance(name, dt):
             reached.add(bound.substeps)
         for speed in (0.999 * near, 1.001 * near + 1e-3):
             state[place] = speed
-            *_, taken = advance(*map(float, scene._form.lift(state)), u, dt, *numbers)
+            *_, taken = advance(*map(float, form_of(scene).lift(state)), u, dt, *numbers)
             expected = scene.step_bound(state, u, dt).substeps
             assert taken == expected or (expected > 500 and 1 < taken < expected)  # along the slow manifold
     assert {1, 2} <= reached or dt > 0.02
@@ -241,7 +242,7 @@ def test_one_substep_leaves_out_no_more_than_the_tolerance(name, dt):
 
 def corners(task):
     """Return the fastest states and strongest controls of a task."""
-    form, reach = task.scene._form, task.examples.reach
+    form, reach = form_of(task.scene), task.examples.reach
     (low,), (high,) = task.control_range
     angle = None if task.certified_speed() is None else form.angle
     for edge, speed, control in product(task.edges, (-reach, reach), (low, high)):
@@ -435,7 +436,7 @@ def test_heavy_drag_in_a_turning_shell_against_collocation():
     dt, spin, control = 0.02, 700.0, -2000.0
     shell = CylinderInCylinder(damping=0.24 * 1e6 / dt)
     end = shell.simulate([0.3, 0.0, spin], [control], dt)[1]
-    exact = exact_ends.flow(shell, [0.3, 0.0, spin], control, dt)
+    exact = exact_ends.exact_flow(shell, [0.3, 0.0, spin], control, dt)
     for value, truth in zip(end, exact, strict=True):
         assert abs(value - truth) < 3e-15 * abs(truth)
 

@@ -12,22 +12,22 @@ from lag_envs import store
 @pytest.mark.parametrize("sync", [False, True])
 def test_written_whole_with_its_folder(tmp_path, sync):
     file = tmp_path / "new" / "file"
-    store.write(file, "ä", sync=sync)
-    store.write(file, b"second", sync=sync)
+    store.write_file(file, "ä", sync=sync)
+    store.write_file(file, b"second", sync=sync)
     assert file.read_bytes() == b"second" and os.listdir(file.parent) == ["file"]
 
 
 @pytest.mark.parametrize("place", [(Path, "write_bytes"), (os, "replace")])
 def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, place):
     file = tmp_path / "file"
-    store.write(file, "old")
+    store.write_file(file, "old")
 
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(*place, full)
     with pytest.raises(OSError, match="No space left"):
-        store.write(file, "new")
+        store.write_file(file, "new")
     assert file.read_text() == "old" and os.listdir(tmp_path) == ["file"]
 
 

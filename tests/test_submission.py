@@ -483,7 +483,7 @@ def test_text_with_something_wrong(folder, old, new, reason):
         ('squash = "clip"', 'squash = "no"', "squash: Input should be '"),
         ('squash = "clip"', "bins = 1", "bins: Input should be greater than or equal to 2"),
         ('squash = "clip"', "bins = 1000000", "bins: Input should be "),
-        ('squash = "clip"', 'squash = "clip"\nbins = 3', "squash means nothing beside bins; leave it out"),
+        ('squash = "clip"', 'squash = "clip"\nbins = 3', "squash has no effect with bins; leave it out"),
         ('squash = "clip"', 'squash = "clip"\nmean_limit = nan', "mean_limit: Input should be "),
         ('squash = "clip"', 'squash = "clip"\nnormalise = {clip = 0}', "clip: Input should be "),
         ('squash = "clip"', 'squash = "clip"\nnormalise = {mean = 0}', "mean is an unknown key"),
@@ -930,7 +930,7 @@ def test_optimal_table_is_the_value_function(env, tmp_path):
     pytest.importorskip("tqdm")
     from dataclasses import replace as replaced
 
-    from agents.optimum import Optimal, Solution
+    from agents.optimum import GreedyPolicy, Solution
     from agents.submit import tabulate
 
     problem = TASKS[env].value_iteration
@@ -954,7 +954,7 @@ def test_optimal_table_is_the_value_function(env, tmp_path):
     if env == pivoted_bar.SwingUpFree.id:
         theta, theta_dot = rng.uniform(-3.0, 3.0, (2, 200))
         seen = np.stack([np.cos(theta), np.sin(theta), theta_dot / 8.0], axis=1)
-        acting, best = agent.predict(seen)[0], Optimal(env, solution=solution).predict(seen)[0]
+        acting, best = agent.predict(seen)[0], GreedyPolicy(env, solution=solution).predict(seen)[0]
         assert (np.abs(acting - best) < 1e-6).mean() > 0.9
 
 

@@ -30,7 +30,7 @@ def made(threads, n=MANY, env_id=ID, **options):
 
 
 def digest(envs, steps, seed=3):
-    """Return a digest of all results of so many steps; with a seed, after a reset."""
+    """Return a digest of all results of this many steps; with a seed, after a reset."""
     found = hashlib.sha256()
     if seed is not None:
         found.update(envs.reset(seed=seed)[0].tobytes())
@@ -105,7 +105,7 @@ def test_types_of_actions_may_change_from_step_to_step():
     for i, action in enumerate(actions(40, MANY, 1)):
         given = action.astype((np.float32, np.float64, np.int64)[i % 3])
         both = envs.step(given)[:4], twin.step(given)[:4]
-        assert all((ours == theirs).all() for ours, theirs in zip(*both, strict=True))
+        assert all((one == two).all() for one, two in zip(*both, strict=True))
 
 
 TOY = """
@@ -225,10 +225,10 @@ def test_after_a_fork_both_processes_go_on():
     if child == 0:
         os.write(sender, digest(envs, 5, seed=None).encode())
         os._exit(0)
-    ours = digest(envs, 5, seed=None)
+    expected = digest(envs, 5, seed=None)
     os.close(sender)
     with os.fdopen(receiver) as file:
-        assert file.read() == ours
+        assert file.read() == expected
     assert os.waitpid(child, 0)[1] == 0
 
 

@@ -20,7 +20,7 @@ from rollouts import one_by_one
 from trainings import go, kill_and_interrupt
 
 from agents import learners, run, train
-from agents.learners import ALGORITHMS, hyperparameters, load_policy
+from agents.learners import ALGORITHMS, load_policy, zoo_hyperparameters
 from agents.run import Run, UserError
 from lag_envs import cli
 from lag_envs.evaluation.rollout import play
@@ -46,7 +46,7 @@ def short(monkeypatch):
 
 
 def make_run(folder, algo="ppo", env_id=ENV, steps=400, **more):
-    hyper = hyperparameters(algo, env_id) | SHORT[algo] | more
+    hyper = zoo_hyperparameters(algo, env_id) | SHORT[algo] | more
     return Run(Path(folder), env_id, algo, 3, steps, hyper)
 
 
@@ -65,7 +65,7 @@ def command(capsys, tmp_path):
 def config(tmp_path):
     """Return a file of hyperparameters with which a run takes seconds."""
     file = tmp_path / "short.yml"
-    entry = {name: value for name, value in hyperparameters("ppo", ENV).items() if name != "env_wrapper"}
+    entry = {name: value for name, value in zoo_hyperparameters("ppo", ENV).items() if name != "env_wrapper"}
     file.write_text(yaml.safe_dump({ENV: entry | SHORT["ppo"] | {"n_timesteps": 400}}))
     return file
 
@@ -87,7 +87,7 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
         cut = make_run(tmp_path / "cut", algo, normalize=True)
         content = cut.load_checkpoint()
         model = learners.thaw(cut, content)
-        # Weights, optimiser, normalisation and memory are restored, and learning goes on.
+        # Weights, optimiser, normalisation and memory are restored, and training continues.
         normalise, buffer = pickle.loads(content["normalisation"]), pickle.loads(content["buffer"])
         assert model.get_vec_normalize_env().obs_rms.mean.tolist() == normalise.obs_rms.mean.tolist()
         assert (buffer is None) == (algo == "ppo") and model.num_timesteps == cut.trained
@@ -151,7 +151,7 @@ def test_hyperparameters_are_there_for_every_environment(algo):
     entries = yaml.safe_load(printed(algo))
     assert list(TASKS) == list(entries)
     for env_id in TASKS:
-        entry = hyperparameters(algo, env_id)
+        entry = zoo_hyperparameters(algo, env_id)
         assert entries[env_id] == entry  # in the Zoo's form they are the same
         assert entry["n_timesteps"] >= 1e4
         policy = f"lag_envs.sb3_policies.{algo.upper()}" if algo in OFF_POLICY else "MlpPolicy"
@@ -160,13 +160,13 @@ def test_hyperparameters_are_there_for_every_environment(algo):
 
 def test_bins_are_gymnasiums():
     with gym.make(ENV) as env:
-        theirs = gym.wrappers.DiscretizeAction(env, 9)
-        np.testing.assert_allclose(bin_centres(9)[:, None], [theirs.action(i) for i in range(9)], atol=1e-7)
+        wrapped = gym.wrappers.DiscretizeAction(env, 9)
+        np.testing.assert_allclose(bin_centres(9)[:, None], [wrapped.action(i) for i in range(9)], atol=1e-7)
 
 
 def test_learners_refuse_what_they_do_not_know(tmp_path):
     with pytest.raises(UserError, match="did you mean tqc"):
-        hyperparameters("tqd", ENV)
+        zoo_hyperparameters("tqd", ENV)
     with pytest.raises(UserError, match="ppo does not take the hyperparameters"):
         go(make_run(tmp_path, nonsense=1))
     with pytest.raises(UserError, match=r"wrapper gymnasium.wrappers.ClipReward is not known"):
@@ -178,7 +178,7 @@ def test_learners_refuse_what_they_do_not_know(tmp_path):
     ):
         (tmp_path / "bad.yml").write_text(text)
         with pytest.raises(UserError, match=message):
-            hyperparameters("ppo", ENV, tmp_path / "bad.yml")
+            zoo_hyperparameters("ppo", ENV, tmp_path / "bad.yml")
 
 
 # --- damaged and foreign files ---
@@ -233,7 +233,7 @@ def test_a_full_disk_loses_nothing_that_was_saved(tmp_path, monkeypatch):
     events = []
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
-        reason = train.work(make_run(tmp_path), events.append)
+        reason = train.train_run(make_run(tmp_path), events.append)
     assert "No space left on device" in reason and "what was saved before is kept" in reason
     assert going.path(run.CHECKPOINT).read_bytes() == saved
     assert go(make_run(tmp_path))
@@ -272,7 +272,9 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         "--output", str(tmp_path),
     )  # fmt: skip
     assert f"agents.train {ENV}" in output
-    content = Run(tmp_path / ENV / "ppo" / "seed0", ENV, "ppo", 0, 30000, hyperparameters("ppo", ENV, config))
+    content = Run(
+        tmp_path / ENV / "ppo" / "seed0", ENV, "ppo", 0, 30000, zoo_hyperparameters("ppo", ENV, config)
+    )
     assert content.load_checkpoint() is not None and content.trained >= 3700 and len(content.curve) >= 3
 
 

@@ -13,6 +13,7 @@ from own_tasks import TASKS as OWN
 
 import lag_envs
 from lag_envs.envs.unfused import Unfused
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.shapes import Circle
 from lag_envs.stepping.general import stepper_of
@@ -105,7 +106,7 @@ def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     outer = made(task)
     scene = outer.scene
     stepper = stepper_of(scene.mechanics)
-    constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
+    constants = stepper.constants(parameter_values(scene))
     code = stepper.code(frozenset(n for n, x in constants.items() if x == 0.0), fused=False)
     advance = code.compile()
     numbers = [constants[name.removeprefix("k_")] for name in code.constants]

@@ -37,7 +37,7 @@ def in_every_mode(of=features):
 
 
 def lasting(env_id, steps):
-    """Return the keyword that limits episodes to so many of the task's own steps."""
+    """Return the keyword that limits episodes to this many of the task's own steps."""
     return {"duration": min(steps, TASKS[env_id].steps) * TASKS[env_id].interval}
 
 
@@ -105,8 +105,8 @@ def assert_alike(native, sync, steps, seed=0):
     given = actions(steps, native.action_space, seed=seed)
     ends = 0
     for action in given:
-        mine, theirs = native.step(action), sync.step(action)
-        assert_same(mine, theirs)
+        mine, synced = native.step(action), sync.step(action)
+        assert_same(mine, synced)
         over = mine[2] | mine[3]
         ends += over.sum()
         mask = over | (rng.random(n) < stray)
@@ -194,9 +194,9 @@ def test_a_sub_environment_is_the_single_one(env_id):
     env.reset(seed=43)
     for action in actions(30, native.action_space):
         mine = native.step(action)
-        theirs = env.step(action[3])
-        assert mine[0][3].tobytes() == theirs[0].tobytes() and mine[1][3] == theirs[1]
-        if theirs[2] or theirs[3]:
+        alone = env.step(action[3])
+        assert mine[0][3].tobytes() == alone[0].tobytes() and mine[1][3] == alone[1]
+        if alone[2] or alone[3]:
             break
 
 

@@ -13,9 +13,9 @@ from test_submission import ENV, NET, built_in, learned, linear, net, network
 
 from lag_envs.evaluation.conditions import disturbances
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.results import apart, build, check, compare, unpacked
+from lag_envs.leaderboard.results import apart, checked_result, code_digest, compare_results, unpacked
 from lag_envs.leaderboard.submission import Refused, load
-from lag_envs.leaderboard.verify import declare_verify, replay, run_verify, verify
+from lag_envs.leaderboard.verify import declare_verify, record_again, run_verify, verify
 from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS
 
@@ -55,8 +55,8 @@ def test_seeds_follow_from_bytes_and_nonce():
 def test_result_is_of_json_types_and_complete(result, submission):
     again = json.loads(json.dumps(result, allow_nan=False))
     assert again == result
-    assert check(result) is result
-    assert (result["env"], result["nonce"], result["build"]) == (ENV, "nonce", build())
+    assert checked_result(result) is result
+    assert (result["env"], result["nonce"], result["build"]) == (ENV, "nonce", code_digest())
     assert result["digest"] == submission.digest and result["episodes"] == 6
     (policy,) = result["policies"]
     assert policy["seed"] == 0 and len(policy["trajectory"]) == 64
@@ -104,11 +104,11 @@ WAY = known_returns(ENV).best - known_returns(ENV).random
 
 def test_results_are_compared(result):
     other = json.loads(json.dumps(result))
-    assert compare(result, other, WAY) == (True, True, 0.0, [])
+    assert compare_results(result, other, WAY) == (True, True, 0.0, [])
     with pytest.raises(ValueError, match="differ in nonce: 'nonce' and 'x'"):
-        compare(result, other | {"nonce": "x"}, WAY)
+        compare_results(result, other | {"nonce": "x"}, WAY)
     with pytest.raises(ValueError, match="differ in their conditions"):
-        compare(result, other | {"robustness": {}}, WAY)
+        compare_results(result, other | {"robustness": {}}, WAY)
 
 
 @pytest.mark.parametrize("changed", [{"build": "0" * 64}, {"versions": {}}, {"machine": {}}, {"build": None}])
@@ -116,9 +116,9 @@ def test_bits_count_on_the_same_build_only(result, changed):
     other = json.loads(json.dumps(result))
     other["policies"][0]["trajectory"] = "0" * 64
     other["policies"][0]["returns"] = [r + 4e-4 * WAY for r in other["policies"][0]["returns"]]
-    found = compare(result, other, WAY)
+    found = compare_results(result, other, WAY)
     assert not found.same and found.build and found.far == ["the bits, though both are of the same build"]
-    found = compare(result, other | changed, WAY)
+    found = compare_results(result, other | changed, WAY)
     assert not found.same and not found.build and found.far == []
     assert found.difference == pytest.approx(4e-4)
 
@@ -149,13 +149,13 @@ def test_whatever_is_another_is_found_on_any_build(result, name, value, episode,
     if value is None:
         value = not result["policies"][0][name][episode]
     other = spoil(result, name, value, episode)
-    assert any(what.startswith(told) for what in compare(result, other, WAY).far)
+    assert any(what.startswith(told) for what in compare_results(result, other, WAY).far)
 
 
 def test_a_condition_that_is_another_is_found(result):
     name = next(iter(result["robustness"]))
     other = spoil(result, "robustness", result["robustness"] | {name: [0.0]})
-    assert compare(result, other, WAY).far == [f"the means under {name}"]
+    assert compare_results(result, other, WAY).far == [f"the means under {name}"]
 
 
 def test_one_episode_of_many_may_go_another_way(result):
@@ -166,9 +166,9 @@ def test_one_episode_of_many_may_go_another_way(result):
     other = json.loads(json.dumps(many))
     for i in range(10):
         other["policies"][0]["returns"][i] += (-1) ** i * 0.5 * WAY
-    assert compare(many, other, WAY).far == []
+    assert compare_results(many, other, WAY).far == []
     other["policies"][0]["returns"][10:12] = [r + 0.1 * WAY for r in other["policies"][0]["returns"][10:12]]
-    assert compare(many, other, WAY).far == ["the returns of 1.2% of the episodes of seed 0"]
+    assert compare_results(many, other, WAY).far == ["the returns of 1.2% of the episodes of seed 0"]
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_results_have_a_schema(result, spoil):
     other = json.loads(json.dumps(result))
     spoil(other)
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
-        check(other)
+        checked_result(other)
 
 
 def test_a_result_is_not_unpacked_for_ever(monkeypatch):
@@ -211,7 +211,7 @@ def test_replays_are_of_the_verified_episodes(tmp_path, make):
     made = make(tmp_path / "a")
     few = verify(made, "n", 5)
     for policy in (0, len(made.policies) - 1):
-        told, episodes = replay(made, few, policy, [3, 0])
+        told, episodes = record_again(made, few, policy, [3, 0])
         verified = few["policies"][policy]
         for name in ("returns", "success", "settle", "effort", "reference"):
             assert told[name] == [verified[name][3], verified[name][0]]

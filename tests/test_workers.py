@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from lag_envs import workers
-from lag_envs.workers import SpreadError, check_address, died, outcomes, processes
+from lag_envs.workers import SpreadError, as_they_finish, check_address, died, processes
 
 HERE = Path(__file__).parents[1]
 greeting = ""
@@ -41,7 +41,7 @@ def test_whatever_becomes_of_one_the_others_go_on():
     threads = os.environ.get("OMP_NUM_THREADS")
     with processes(2, begin, "hello") as submit:
         limits = {"hangs": 3.0}
-        found = dict(outcomes({submit(work, what, timeout=limits.get(what)): what for what in given}))
+        found = dict(as_they_finish({submit(work, what, timeout=limits.get(what)): what for what in given}))
     assert found["works"] == found["works too"] == ("hello", "1")
     assert died(found["dies"]) == "the process died, exit status 3"
     assert died(found["is killed"]) == "the process died, exit status -9"

@@ -12,14 +12,14 @@ ROOT = Path(__file__).parents[1]
 
 
 def go(run, until=10**9):
-    """Train until so many steps are done; return whether the run is finished."""
+    """Train until this many steps are done; return whether the run is finished."""
 
     def show(run):
         if until <= run.trained < run.steps:
             raise KeyboardInterrupt
 
     try:
-        learners.train(run, show=show, tested=lambda run: None)
+        learners.train_rest(run, show=show, tested=lambda run: None)
     except KeyboardInterrupt:
         return False
     return True

@@ -3,8 +3,8 @@
 ``python -m tools.double_pendulum CHECKOUT`` needs a checkout of
 github.com/dfki-ric-underactuated-lab/double_pendulum, and SciPy, SymPy and PyYAML. It compares parameters and
 accelerations, and runs the project's own LQR, with its friction compensation, from near upright on both its
-simulator, which takes a Runge-Kutta step in each control interval, and ours. It fails if the results differ
-by more than that integrator's error.
+simulator, which takes a Runge-Kutta step in each control interval, and lag_envs's. It fails if the results
+differ by more than that integrator's error.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ import numpy as np
 
 import lag_envs  # noqa: F401 (registers the ids)
 from lag_envs.controllers import make_controller
+from lag_envs.mechanics.recording import parameter_values
 
 MODEL = Path("data/system_identification/identified_parameters/design_C.1/model_1.0/model_parameters.yml")
 #: The driven joint.
 ROBOTS = {"AcrobotReal-v0": 1, "PendubotReal-v0": 0}
-#: Our order of the state from theirs: (angles, rates).
+#: Order of the state in lag_envs, by the project's, (angles, rates).
 ORDER = [0, 2, 1, 3]
 START = [np.pi + 0.05, -0.03, 0.0, 0.0]
 #: Torque limit of the idle motor [N m], and the identified friction.
@@ -57,13 +58,14 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
     from double_pendulum.simulation.simulation import Simulator  # type: ignore[import-not-found]
 
     env: Any = gym.make(env_id).unwrapped
-    theirs = model_parameters(filepath=str(checkout / MODEL))
+    model = model_parameters(filepath=str(checkout / MODEL))
     limits = [IDLE, IDLE]
     limits[joint] = float(env.task.limit_control)
-    theirs.set_torque_limit(limits)
-    plant = DoublePendulumPlant(model_pars=theirs)
-    # Both motors and all friction: theirs compensates the idle joint's by its motor, ours leaves it out.
-    names = {name: getattr(env.scene, name) for name in env.scene._numbers()}
+    model.set_torque_limit(limits)
+    plant = DoublePendulumPlant(model_pars=model)
+    # Both motors and all friction: the project compensates that of the idle joint by its motor, lag_envs
+    # leaves it out.
+    names = parameter_values(env.scene)
     whole = type(env.scene)(control="both", **(names | FRICTION))
 
     worst = accelerations(whole, plant)
@@ -71,24 +73,24 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
 
     simulator = Simulator(plant=plant)
     times, states, torques = simulator.simulate(
-        t0=0.0, x0=START, tf=env.task.duration, dt=env.task.dt, controller=published(theirs, joint)
+        t0=0.0, x0=START, tf=env.task.duration, dt=env.task.dt, controller=published(model, joint)
     )
     path = np.array(states)[:, ORDER]
     # Each of their steps, repeated from its start.
     alone = [whole.simulate(y, [u], env.task.dt)[1] for y, u in zip(path[:-1], torques, strict=True)]
     local = float(np.median(np.abs(np.array(alone) - path[1:]).max(axis=1)))
-    print(f"  their torques on ours, step by step: {local:.1e} apart in the median")
+    print(f"  the project's torques on lag_envs, step by step: {local:.1e} apart in the median")
 
-    ours, their_time = [np.array(START)[ORDER]], swing(get_swingup_time, times, path, theirs)
-    observation, _ = env.reset(seed=0, options={"state": ours[0]})
+    own_path, their_time = [np.array(START)[ORDER]], swing(get_swingup_time, times, path, model)
+    observation, _ = env.reset(seed=0, options={"state": own_path[0]})
     agent, memory, over, total = make_controller(env_id, "LQR"), None, False, 0.0
     while not over:
         action, memory = agent.predict(observation, memory)
         observation, reward, terminated, truncated, _ = env.step(action)
         total, over = total + float(reward), terminated or truncated
-        ours.append(env.state)
-    end = np.array(ours)
-    our_time = swing(get_swingup_time, np.arange(len(end)) * env.task.dt, end, theirs)
+        own_path.append(env.state)
+    end = np.array(own_path)
+    our_time = swing(get_swingup_time, np.arange(len(end)) * env.task.dt, end, model)
     apart = np.abs(end - path[: len(end)]).max()
     print(f"  the LQR on both: {apart:.1e} apart at most")
     print(f"  up after {their_time:.3f} s there, {our_time:.3f} s here")
@@ -104,26 +106,26 @@ def accelerations(scene: Any, plant: Any) -> float:
     states = rng.uniform(-1.0, 1.0, (10_000, 4)) * [np.pi, 20.0, np.pi, 20.0]
     torques = rng.uniform(-6.0, 6.0, (len(states), 2))
     found = scene.acceleration(states, torques)
-    ours = np.stack([found["theta_1"], found["theta_2"]], axis=-1)
-    theirs = np.array([plant.forward_dynamics(y[ORDER], u) for y, u in zip(states, torques, strict=True)])
-    return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
+    own = np.stack([found["theta_1"], found["theta_2"]], axis=-1)
+    project = np.array([plant.forward_dynamics(y[ORDER], u) for y, u in zip(states, torques, strict=True)])
+    return float(np.abs(own - project).max() / np.abs(project).max())
 
 
-def published(theirs: Any, joint: int) -> Any:
+def published(model: Any, joint: int) -> Any:
     """Return the project's LQR as on its leaderboard, with friction compensated as on its machine."""
     from double_pendulum.controller.lqr.lqr_controller import LQRController  # type: ignore[import-not-found]
     from double_pendulum.model.model_parameters import model_parameters  # type: ignore[import-not-found]
 
     ideal = model_parameters()
-    ideal.set_mass(theirs.m)
-    ideal.set_length(theirs.l)
-    ideal.set_com(theirs.r)
-    ideal.set_inertia(theirs.I)
-    ideal.set_gravity(theirs.g)
+    ideal.set_mass(model.m)
+    ideal.set_length(model.l)
+    ideal.set_com(model.r)
+    ideal.set_inertia(model.I)
+    ideal.set_gravity(model.g)
     ideal.set_damping([0.0, 0.0])
     ideal.set_cfric([0.0, 0.0])
     ideal.set_motor_inertia(0.0)
-    ideal.set_torque_limit([0.0 if i != joint else most for i, most in enumerate(theirs.tl)])
+    ideal.set_torque_limit([0.0 if i != joint else most for i, most in enumerate(model.tl)])
     weights, effort = {
         1: ((0.97, 0.93, 0.39, 0.26), 0.11),
         0: ((0.00125, 0.65, 0.000688, 0.000936), 25.0),
@@ -132,7 +134,7 @@ def published(theirs: Any, joint: int) -> Any:
     controller.set_goal([np.pi, 0.0, 0.0, 0.0])
     controller.set_cost_matrices(Q=np.diag(weights), R=effort * np.eye(2))
     controller.set_parameters(failure_value=0.0, cost_to_go_cut=15.0)
-    controller.set_friction_compensation(damping=theirs.b, coulomb_fric=theirs.cf)
+    controller.set_friction_compensation(damping=model.b, coulomb_fric=model.cf)
     controller.init()
     return controller
 

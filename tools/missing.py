@@ -14,10 +14,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.measured import known
+from lag_envs.tasks.measured import measured_ids
 from tools.options import take_none
 
 ROOT = Path(__file__).parents[1]
@@ -65,7 +65,7 @@ def _there(what: str) -> frozenset[str]:
     found: Iterable[str]
     match what:
         case "returns":
-            found = known()
+            found = measured_ids()
         case "rollouts":
             found = (name.partition("/")[0] for name in _json(ROOT / "tests" / "golden" / "runs.json"))
         case "plan":
@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     take_none("python -m tools.missing", __doc__, arguments)
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
     print(
-        "\n".join(columns([["environment", "missing", "command"], *rows])) if rows else "Nothing is missing."
+        "\n".join(aligned([["environment", "missing", "command"], *rows])) if rows else "Nothing is missing."
     )
     return 1 if rows else 0
 

@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode
 
 from lag_envs import nvrtc
 from lag_envs.envs.kernels import APART, kernels_of
-from lag_envs.envs.single import key_of, start_options
-from lag_envs.envs.vector import LagrangianVectorEnv, named, seeds_of
+from lag_envs.envs.single import seed_key, start_options
+from lag_envs.envs.vector import LagrangianVectorEnv, for_environment, seeds_of
 from lag_envs.scenes.checks import check_count
 from lag_envs.stepping.cache import kept
 from lag_envs.tasks.base import Task
@@ -93,8 +93,8 @@ class DeviceEnvs:
         self.task = sample.task
         kernels = kernels_of(self.task, dtype == torch.float32)
         self._launch = (load or load_nvrtc)(kernels.source, self.device, dtype == torch.float32)
-        self._limit = int(min(sample._constants[0]["limit"], ENDLESS))
-        self._shape = self.num_envs, *sample._actions.shape
+        self._limit = int(min(sample.limits[0], ENDLESS))
+        self._shape = self.num_envs, *(sample.single_action_space.shape or ())
         self._states = slice(0, len(self.task.formulas.state))
         self._targets, self._controls = kernels.targets, kernels.controls
         self.rows = self._new(kernels.kept, dtype=dtype).zero_()
@@ -138,7 +138,7 @@ class DeviceEnvs:
             self._ids[0] = torch.from_numpy(drawn).to(self.device)
         if seeds:
             lanes = torch.tensor([i for i, _ in seeds], device=self.device)
-            keys = np.array([key_of(s) for _, s in seeds], np.uint64).view(np.int64)
+            keys = np.array([seed_key(s) for _, s in seeds], np.uint64).view(np.int64)
             chosen = mask[lanes]
             self._ids[0, lanes[chosen]] = torch.from_numpy(keys).to(self.device)[chosen]
             self._ids[1, lanes[chosen]] = 0
@@ -206,7 +206,7 @@ class DeviceEnvs:
             raise ValueError(f"options[{name!r}] must have shape {shape}, got {array.shape}")
         found = np.zeros((self.num_envs, width))
         for i in torch.nonzero(mask)[:, 0].tolist():
-            found[i] = named(i, check, array[i])
+            found[i] = for_environment(i, check, array[i])
         return torch.from_numpy(found).to(self.device, self.dtype)
 
 
@@ -222,12 +222,12 @@ def load_nvrtc(source: str, device: torch.device, single: bool) -> Launch:
 
     def launch(name: str, count: int, *arguments: Any) -> None:
         stream = torch.cuda.current_stream(device).cuda_stream
-        module.launch(name, count, stream, [count, *map(address, arguments)])
+        module.launch(name, count, stream, [count, *map(kernel_argument, arguments)])
 
     return launch
 
 
-def address(argument: Tensor | int | None) -> int:
+def kernel_argument(argument: Tensor | int | None) -> int:
     """Return a kernel's argument as an integer: a tensor's address, a number, or a null pointer."""
     if argument is None:
         return 0

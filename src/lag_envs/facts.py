@@ -13,7 +13,8 @@ import numpy as np
 
 from lag_envs.envs.single import observation_space
 from lag_envs.scenes.checks import StepRefused
-from lag_envs.tables import columns
+from lag_envs.scenes.derivation import layout_of
+from lag_envs.tables import aligned
 from lag_envs.tasks.base import Task
 
 
@@ -47,7 +48,7 @@ def facts(task: Task, name: str) -> list[str]:
 
 
 def _indented(rows: list[tuple[str, ...]]) -> list[str]:
-    return [f"  {line}" for line in columns(rows)] if rows else ["  none"]
+    return [f"  {line}" for line in aligned(rows)] if rows else ["  none"]
 
 
 def _description(task: Task) -> str:
@@ -148,7 +149,7 @@ def _accuracy(task: Task) -> list[str]:
         ]
     speed = task.certified_speed()
     if speed is not None and speed >= 0.0:
-        shown, rate = math.floor(10.0 * speed) / 10.0, f"{scene._layout.free[0]}_dot"
+        shown, rate = math.floor(10.0 * speed) / 10.0, f"{layout_of(scene).free[0]}_dot"
         lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
     elif speed is not None:
         lines += ["no speed is certified for one substep: the bound before each step decides their number"]

@@ -40,7 +40,7 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def installed(libraries: Iterable[str]) -> dict[str, str]:
+def installed_versions(libraries: Iterable[str]) -> dict[str, str]:
     """Return the versions of the libraries that are installed."""
     found = {}
     for name in libraries:

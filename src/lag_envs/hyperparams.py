@@ -31,7 +31,7 @@ _POLICY: Mapping[str, Any] = {"net_arch": [64, 64], "noise_steps": 8, "first_lay
 #: For each learner, the hyperparameters for any task.
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     # Exploration uses noise that depends on the state (gSDE) and is kept for some steps; it moves the bar,
-    # whereas noise drawn anew at each step averages out. Observations are of order one already; rewards are
+    # whereas noise redrawn at each step averages out. Observations are of order one already; rewards are
     # scaled by their running spread.
     "ppo": {
         "n_envs": 64,

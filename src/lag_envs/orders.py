@@ -17,7 +17,7 @@ ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
 SAME = 1.02
 
 
-def measure(
+def measure_orders(
     task: type[Any],
     num_envs: int = 1024,
     rounds: int = 9,
@@ -65,7 +65,7 @@ def measure(
     return {order: median(times) for order, times in samples.items()}
 
 
-def best(times: dict[int, float]) -> int:
+def best_order(times: dict[int, float]) -> int:
     """Return the lowest order whose time does not differ from the fastest by more than noise."""
     fastest = min(times.values())
     return next(order for order, taken in times.items() if taken <= SAME * fastest)
@@ -73,7 +73,7 @@ def best(times: dict[int, float]) -> int:
 
 def lines(task: type[Any], times: dict[int, float], now: int) -> Sequence[str]:
     """Return the table, and the advice for the task."""
-    found = best(times)
+    found = best_order(times)
     rows = [f"{order:5}  {taken:8.1f}  {taken / times[found]:5.2f}" for order, taken in times.items()]
     if times[now + now % 2] <= SAME * times[found]:
         advice = f"{task.__name__} is stepped by order {now}, which is as fast as any."

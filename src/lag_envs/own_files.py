@@ -21,18 +21,18 @@ GUIDE = "docs/tutorial.md and examples/ball_on_beam.py show how"
 
 
 def is_file(name: str) -> bool:
-    """Tell whether a name on the command line is a file rather than an id.
+    """Return whether a name on the command line is a file rather than an id.
 
     Examples
     --------
     >>> [is_file(name) for name in ("PivotedBar-v0", "mine.py", "mine.py:Balance", "./mine")]
     [False, True, True, True]
     """
-    path = split(name)[0]
+    path = split_path(name)[0]
     return path.endswith(".py") or bool(re.search(r"[/\\]", path)) or Path(path).is_file()
 
 
-def split(name: str) -> tuple[str, str]:
+def split_path(name: str) -> tuple[str, str]:
     r"""Return path and class; on Windows a path may contain a colon itself.
 
     Examples
@@ -45,7 +45,7 @@ def split(name: str) -> tuple[str, str]:
 
 
 @cache
-def load(path: str) -> ModuleType:
+def load_module(path: str) -> ModuleType:
     """Run a file and return its module.
 
     Raises
@@ -112,7 +112,7 @@ def tasks(path: str) -> dict[str, type[Any]]:
     from lag_envs.tasks.base import Task
 
     found = {}
-    for name, kind in _classes(load(path)).items():
+    for name, kind in _classes(load_module(path)).items():
         scene = getattr(kind, "scene", None)
         if issubclass(kind, Task) and isinstance(scene, type) and issubclass(scene, Scene):
             found[name] = kind
@@ -123,7 +123,7 @@ def scenes(path: str) -> dict[str, type[Any]]:
     """Return the scenes that a file defines, by name."""
     from lag_envs.scenes.base import Scene
 
-    return {name: kind for name, kind in _classes(load(path)).items() if issubclass(kind, Scene)}
+    return {name: kind for name, kind in _classes(load_module(path)).items() if issubclass(kind, Scene)}
 
 
 def _classes(module: ModuleType) -> dict[str, type]:
@@ -134,7 +134,7 @@ def _classes(module: ModuleType) -> dict[str, type]:
     }
 
 
-def chosen(name: str) -> dict[str, type[Any]]:
+def chosen_tasks(name: str) -> dict[str, type[Any]]:
     """Return the tasks of ``FILE`` or ``FILE:Class``, by name.
 
     Raises
@@ -142,7 +142,7 @@ def chosen(name: str) -> dict[str, type[Any]]:
     UserError
         If there are none.
     """
-    path, kind = split(name)
+    path, kind = split_path(name)
     found = tasks(path)
     if kind:
         if kind not in found:
@@ -159,21 +159,21 @@ def chosen(name: str) -> dict[str, type[Any]]:
 
 def one(name: str) -> type[Any]:
     """Return the only task of ``FILE`` or ``FILE:Class``, or raise a UserError that lists them."""
-    found = chosen(name)
+    found = chosen_tasks(name)
     if len(found) > 1:
-        path = split(name)[0]
+        path = split_path(name)[0]
         raise UserError(
             f"{path} has several tasks: name one, {' or '.join(f'{path}:{kind}' for kind in found)}"
         )
     return next(iter(found.values()))
 
 
-def made(kind: type[Any], path: str) -> Any:
+def made_with_defaults(kind: type[Any], path: str) -> Any:
     """Return a task or scene with its defaults, or raise a UserError with the fault in its formulas."""
     try:
         return kind()
     except (TypeError, ValueError) as error:
-        raise UserError(f"{split(path)[0]}: {error}") from error
+        raise UserError(f"{split_path(path)[0]}: {error}") from error
 
 
 def registered(name: str) -> list[str]:
@@ -181,8 +181,8 @@ def registered(name: str) -> list[str]:
     import gymnasium as gym
 
     ids = []
-    for kind in chosen(name).values():
-        made(kind, name)
+    for kind in chosen_tasks(name).values():
+        made_with_defaults(kind, name)
         id = kind.id or f"{kind.__name__}-v0"
         if id not in gym.registry or gym.registry[id].kwargs.get("task") not in (kind, _place(kind)):
             gym.registry.pop(id, None)

@@ -20,7 +20,7 @@ STICKS = ("left stick, to the sides", "left stick, up and down", "right stick, t
 DEAD = 0.12
 
 
-def keys_of(space: gym.Space) -> list[tuple[str, str]]:
+def keys_by_number(space: gym.Space) -> list[tuple[str, str]]:
     """Return the keys for each number of an action; controls beyond the pairs of keys stay at rest."""
     if isinstance(space, gym.spaces.Discrete):
         count = 1
@@ -29,7 +29,7 @@ def keys_of(space: gym.Space) -> list[tuple[str, str]]:
     return list(PAIRS[:count])
 
 
-def action_of(
+def pressed_action(
     space: gym.Space,
     pressed: Callable[[str], bool],
     rest: Sequence[float],
@@ -50,7 +50,7 @@ def action_of(
     """
     numbers = list(rest)
     sizes = [int(space.n)] if isinstance(space, gym.spaces.Discrete) else getattr(space, "nvec", None)
-    for i, (down, up) in enumerate(keys_of(space)):
+    for i, (down, up) in enumerate(keys_by_number(space)):
         top = float(space.high[i]) if isinstance(space, gym.spaces.Box) else 0.0
         low, high = (-top, top) if sizes is None else (0.0, float(sizes[i]) - 1.0)
         push = float(sticks[i]) if i < len(sticks) else 0.0
@@ -119,7 +119,7 @@ def resting(task: Any) -> list[float]:
 def help_of(task: Any, space: gym.Space) -> list[str]:
     """Return the instructions for the driver."""
     names = [acting.control for acting in getattr(task.formulas, "acting", ())] or ["control"]
-    ways = zip(names, keys_of(space), STICKS, strict=False)
+    ways = zip(names, keys_by_number(space), STICKS, strict=False)
     lines = [f"{name}: keys {down} and {up}, or {stick}" for name, (down, up), stick in ways]
     return [
         *(lines or ["there is nothing to control: just watch"]),
@@ -163,7 +163,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None, **option
     begun = 0
     try:
         while pygame.display.get_init() and not pressed("q") and (steps is None or taken < steps):
-            action = action_of(env.action_space, pressed, rest, pad.sticks())
+            action = pressed_action(env.action_space, pressed, rest, pad.sticks())
             refused = False
             try:
                 _, reward, terminated, truncated, _ = env.step(action)

@@ -174,14 +174,14 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
             f"the drive was made with another step ({drive.step}, here {env.program.digest}), by another "
             "version of lag_envs or of the environment; its bits can only be recomputed with that"
         )
-    keys = keys_of(drive, task)
+    keys = drive_keys(drive, task)
     env.reset(drive.seed)
     total, terminated, over = 0.0, False, False
     for i, key in enumerate(keys):
         if over:
             raise LinkError(f"the episode ends after {i} steps, the link has {len(keys)}: it is forged")
         try:
-            _, reward, terminated, truncated = env.step(action_of(key, task))
+            _, reward, terminated, truncated = env.step(action_from_numbers(key, task))
         except StepRefused as error:
             raise LinkError(f"step {i + 1} cannot be taken: {error}") from error
         total, over = total + reward, terminated or truncated
@@ -189,14 +189,14 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     return Replayed(total, true, over, terminated, score(drive.id, total) if drive.id in TASKS else None)
 
 
-def action_of(key: Sequence[int], task: Any) -> Any:
+def action_from_numbers(key: Sequence[int], task: Any) -> Any:
     """Return the action for a step's numbers."""
     if task.formulas.choices:
         return key[0] if len(task.formulas.choices) == 1 else list(key)
     return [task.formulas.largest * (n / LEVELS) for n in key]
 
 
-def keys_of(drive: Drive, task: Any) -> list[tuple[int, ...]]:
+def drive_keys(drive: Drive, task: Any) -> list[tuple[int, ...]]:
     """Return a drive's keys, or raise a LinkError if they do not fit the task."""
     formulas = task.formulas
     keys = unpack(drive.keys, formulas.actions)
@@ -282,9 +282,9 @@ def run(args: argparse.Namespace) -> int:
     if args.file:
         from lag_envs import own_files
 
-        task = own_files.made(own_files.one(args.file), args.file)
+        task = own_files.made_with_defaults(own_files.one(args.file), args.file)
     found = replay(drive, task)
-    steps = len(keys_of(drive, task or _task(drive.id)))
+    steps = len(drive_keys(drive, task or _task(drive.id)))
     ending = (
         "terminated" if found.terminated else "its time is up" if found.finished else "stopped before its end"
     )

@@ -1,6 +1,6 @@
 """Policies of Stable-Baselines3's SAC, TD3 and TQC that explore with noise kept for some steps.
 
-Noise drawn anew at each step averages out before it has moved anything heavy. Here each environment keeps its
+Noise redrawn at each step averages out before it has moved anything heavy. Here each environment keeps its
 draw for `noise_steps` steps. The learning itself is the library's.
 
 `agents.train` and the RL Zoo take these policies by name, as in ``policy: lag_envs.sb3_policies.SAC``.

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 
 
 class Scale(Protocol):
@@ -67,7 +67,7 @@ class KnownReturns(NamedTuple):
 
 def known_returns(env_id: str) -> KnownReturns | None:
     """Return the known returns of an environment; None if none were measured."""
-    scale = measured(env_id).get("scale")
+    scale = measured_entry(env_id).get("scale")
     return scale and KnownReturns(**scale)
 
 
@@ -106,10 +106,10 @@ def share_of_privileged(env_id: str) -> float | None:
     >>> share_of_privileged("PivotedBar-v0") is None
     True
     """
-    found = measured(env_id).get("measured", {})
+    found = measured_entry(env_id).get("measured", {})
     if "privileged" not in found:
         return None
-    return float(found[measured(env_id)["scale"]["policy"]]["mean"] / found["privileged"]["mean"])
+    return float(found[measured_entry(env_id)["scale"]["policy"]]["mean"] / found["privileged"]["mean"])
 
 
 def in_words(env_id: str, total: float, whole: bool = True) -> str:

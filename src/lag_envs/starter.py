@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from lag_envs.errors import UserError
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 TEMPLATE = Path(__file__).with_name("starter.py.txt")
 
@@ -29,7 +29,7 @@ def start(path: Path) -> Path:
     if not path.absolute().parent.is_dir():
         raise UserError(f"there is no folder {path.absolute().parent}")
     try:
-        write(path, filled(path.stem))
+        write_file(path, filled(path.stem))
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror}") from error
     return path

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 
-def write(path: Path, data: bytes | str, sync: bool = False) -> None:
+def write_file(path: Path, data: bytes | str, sync: bool = False) -> None:
     """Write a file whole or not at all; with `sync`, a power cut cannot lose it either."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")

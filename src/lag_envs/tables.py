@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Align the rows' cells; columns of numbers, apart from their heads, are aligned to the right.
 
     Examples

@@ -130,7 +130,7 @@ class Step:
             targets = given.reshape(n_targets).expand(*shape, n_targets)
         _check("targets", targets, (*shape, n_targets))
         rows = (x.reshape(shape.numel(), x.shape[-1]) for x in (states, actions, targets))
-        found = _Step.apply(self.model, *rows)
+        found = _RowStep.apply(self.model, *rows)
         return StepResult(*(x.reshape((*shape, *x.shape[1:])) for x in found))
 
 
@@ -205,7 +205,7 @@ class TorchVectorEnv:
         )
         if not isinstance(made, LagrangianVectorEnv):
             raise ValueError(f"{task} has no derivatives: it is no environment of this package")
-        if any(other is not made.task for other in made._tasks):
+        if any(other is not made.task for other in made.tasks):
             raise ValueError("gradients need the same parameters in all environments; give one value for all")
         _checked_task(made.task)
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
@@ -316,7 +316,7 @@ class TorchVectorEnv:
         return list(results)
 
 
-class _Step(torch.autograd.Function):
+class _RowStep(torch.autograd.Function):
     """`Step`, on rows."""
 
     @staticmethod
@@ -339,15 +339,15 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *seeds: Tensor) -> tuple:
-        return None, *_Back.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
+        return None, *_RowStepBackward.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
-        return _over_batch(_Step, info, in_dims, given)
+        return _over_batch(_RowStep, info, in_dims, given)
 
 
-class _Back(torch.autograd.Function):
-    """The derivatives of `_Step`."""
+class _RowStepBackward(torch.autograd.Function):
+    """The derivatives of `_RowStep`."""
 
     @staticmethod
     def forward(
@@ -383,7 +383,7 @@ class _Back(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
-        return _over_batch(_Back, info, in_dims, given)
+        return _over_batch(_RowStepBackward, info, in_dims, given)
 
 
 class _EnvStep(torch.autograd.Function):
@@ -395,13 +395,14 @@ class _EnvStep(torch.autograd.Function):
         ctx.model, ctx.targets = env.model, envs.target
         ctx.set_materialize_grads(False)
         #: Environments that take a step, and those whose episode continues in the resulting state; None: all.
-        ctx.stepped = ctx.kept = envs._read("n") >= 0.0 if envs._over else None
+        ended = envs.ended
+        ctx.stepped = ctx.kept = None if ended is None else ~ended
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
         if (
             envs.autoreset_mode == AutoresetMode.SAME_STEP
-            and (ended := (terminated | truncated).numpy()).any()
+            and (over := (terminated | truncated).numpy()).any()
         ):
-            ctx.kept = ~ended
+            ctx.kept = ~over
         after = torch.from_numpy(envs.state)
         ctx.save_for_backward(state, actions, after)
         ctx.mark_non_differentiable(terminated, truncated)

@@ -23,7 +23,7 @@ GIF_RATE = 25.0
 ALL_HAVE = ("zero", "random")
 
 
-class Known(NamedTuple):
+class NamedAgent(NamedTuple):
     """An agent that has a name.
 
     Attributes
@@ -38,11 +38,11 @@ class Known(NamedTuple):
     about: str
 
 
-def known(task: Any, env_id: str) -> list[Known]:
+def named_agents(task: Any, env_id: str) -> list[NamedAgent]:
     """Return the named agents of an environment, the default one first."""
     found = []
     if (own := shipped().get(env_id)) is not None:
-        found.append(Known(own.name, f"comes with the package, score {own.score:.3f}"))
+        found.append(NamedAgent(own.name, f"comes with the package, score {own.score:.3f}"))
     taken = {agent.name for agent in found}
     controllers = [*task.controllers, *ALL_HAVE]
     if task.reference in controllers:  # a quick one is the default
@@ -51,11 +51,11 @@ def known(task: Any, env_id: str) -> list[Known]:
         if name not in taken:
             entry = task.controllers.get(name)
             plans = ", plans for seconds before each episode" if entry is not None and entry.plans else ""
-            found.append(Known(name, f"controller{plans}"))
+            found.append(NamedAgent(name, f"controller{plans}"))
     return found
 
 
-def load(env_id: str, task: Any, name: str | None, board: Path | None = None) -> tuple[str, Any]:
+def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = None) -> tuple[str, Any]:
     """Return an agent's name, and an object with the `predict` of Stable-Baselines3.
 
     Parameters
@@ -65,9 +65,9 @@ def load(env_id: str, task: Any, name: str | None, board: Path | None = None) ->
     task : Task
         Its task.
     name : str, optional
-        One of `known`, a verified submission of the board by name or id, or the path of a submission's
+        One of `named_agents`, a verified submission of the board by name or id, or the path of a submission's
         folder, of a model of Stable-Baselines3 or of the folder of its training. By default the first of
-        `known`.
+        `named_agents`.
     board : Path, optional
         A board's folder.
 
@@ -76,7 +76,7 @@ def load(env_id: str, task: Any, name: str | None, board: Path | None = None) ->
     UserError
         If there is no such agent, or it does not fit this environment.
     """
-    names = {agent.name.lower(): agent.name for agent in known(task, env_id)}
+    names = {agent.name.lower(): agent.name for agent in named_agents(task, env_id)}
     name = next(iter(names.values())) if name is None else names.get(name.lower(), name)
     own = shipped().get(env_id)
     if own is not None and name == own.name:
@@ -151,10 +151,10 @@ def _model(env_id: str, path: Path) -> Any:
         raise UserError(
             f"{path} observes {model.observation_space.shape} numbers, {env_id} has {spaces[0].shape}"
         )
-    return Model(model, normalise, spaces[1])
+    return SB3Model(model, normalise, spaces[1])
 
 
-class Model:
+class SB3Model:
     """A Stable-Baselines3 model, given the environment's own observations and returning its actions.
 
     Parameters

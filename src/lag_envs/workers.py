@@ -1,7 +1,7 @@
 """Functions in other processes, or on the machines of a Ray cluster: a crash or hang costs only that work.
 
 Both context managers yield a function ``submit(function, *args, timeout=None)``, which returns a
-`concurrent.futures.Future`; `outcomes` waits for many.
+`concurrent.futures.Future`; `as_they_finish` waits for many.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class SpreadError(Exception):
     """The work cannot be spread; the text says why, and what to do."""
 
 
-def outcomes(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
+def as_they_finish(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
     """Yield what each future returned or raised, in the order in which they finish."""
     for future in as_completed(futures):
         yield futures[future], future.exception() or future.result()

@@ -1,7 +1,7 @@
 """Write the texts generated from the environments' records into README and docs: ``python -m tools.docs``.
 
 ``python -m tools.docs --pictures`` also draws the environments' moving pictures, from episodes of the
-leaderboard's best learned agents; with ids, only theirs.
+leaderboard's best learned agents; with ids, only those of these environments.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lag_envs.generated import replaced
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tasks import TASKS
 from tools.docs.environments import ROOT, by_scene
 
@@ -30,11 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     args = parser.parse_args(arguments)
     for path, text in generated(ROOT).items():
-        write(path, text)
+        write_file(path, text)
     if args.pictures is not None:
-        from tools.docs.pictures import draw
+        from tools.docs.pictures import draw_environments
 
-        draw(ROOT / "leaderboard", ROOT / "docs" / "images" / "moving", args.pictures or TASKS)
+        draw_environments(ROOT / "leaderboard", ROOT / "docs" / "images" / "moving", args.pictures or TASKS)
     return 0
 
 

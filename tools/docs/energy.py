@@ -1,4 +1,4 @@
-"""Gymnasium's environments and ours with the same spaces: one policy in both, and energy against time.
+"""Gymnasium's environments and their counterparts here: one policy in both, and energy against time.
 
 ``python -m tools.docs.energy`` prints the returns of a task's reference controller in both, and draws
 ``docs/images/energy-ID.png``. It plots the energy minus the control's work since the start, under random
@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers import make_controller
-from lag_envs.report.episodes import random_actions
-from lag_envs.report.gymnasium_peers import PEERS, watch
+from lag_envs.report.episodes import endless_actions
+from lag_envs.report.gymnasium_peers import PEERS, record_peer
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
 from tools.options import take_none
 
@@ -49,13 +50,13 @@ def returns(env_id: str, agent: Any, episodes: int) -> Array:
     return total
 
 
-def balance(scene: Scene, states: Array, controls: Array) -> Array:
+def energy_minus_work(scene: Scene, states: Array, controls: Array) -> Array:
     """Return the energy minus the control's work [J] along states (n + 1, n_state), controls held between.
 
     The control is a constant force or torque on coordinates, independent of the state, so its work in a step
     is that force times their change.
     """
-    layout = scene._layout
+    layout = layout_of(scene)
     places = [layout.state.index(e) for e in layout.state if e.kind == "place"]
     zero, one = (np.array([float(u) for u in _forces(scene, u).values()]) for u in (0.0, 1.0))
     turned = np.diff(states[:, places], axis=0)
@@ -82,21 +83,21 @@ def paths(env_id: str, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     Both start from the same state of mid-task motion, and continue past the end of an episode.
     """
     task = TASKS[env_id]()
-    peer, theirs = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped
-    theirs.reset(seed=seed)
+    peer, original = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped
+    original.reset(seed=seed)
     start = np.array(task.examples.start["state"], np.float64)
-    theirs.state = start[np.argsort(peer.order)]  # type: ignore[attr-defined]
-    actions = random_actions(theirs, seed)
+    original.state = start[np.argsort(peer.order)]  # type: ignore[attr-defined]
+    actions = endless_actions(original, seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the episode is over
-        own = watch(theirs, peer, actions, int(task.limit), to_the_end=False)
+        own = record_peer(original, peer, actions, int(task.limit), to_the_end=False)
     exact, controls = task.scene.simulate(start, own.controls, task.dt), np.array(own.controls)
     times = task.dt * np.arange(len(exact))
     found = {task.peer: own.states[:, list(peer.order)], env_id: exact}
-    return {name: (times, balance(task.scene, y, controls)) for name, y in found.items()}
+    return {name: (times, energy_minus_work(task.scene, y, controls)) for name, y in found.items()}
 
 
-def picture(env_id: str) -> Any:
+def energy_figure(env_id: str) -> Any:
     """Return the figure of an environment."""
     from matplotlib.figure import Figure
 
@@ -127,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, (_, energy) in paths(env_id).items():
             low, high = energy.min(), energy.max()
             print(f"{name:20} energy less work: {energy[0]:.3f} J at first, {low:.3f} to {high:.3f} J")
-        save(picture(env_id), ROOT / "docs" / "images" / f"energy-{env_id}.png")
+        save(energy_figure(env_id), ROOT / "docs" / "images" / f"energy-{env_id}.png")
     return 0
 
 

@@ -19,17 +19,26 @@ import numpy as np
 
 from lag_envs.envs.actions import Actions
 from lag_envs.envs.single import observation_space
-from lag_envs.leaderboard.docs import plain
+from lag_envs.leaderboard.docs import plain_markdown
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene
 from lag_envs.scenes.declaring import complete
+from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 from tools.docs import equations
-from tools.docs.markdown import cell, described, first_line, number, plus_minus, sections
+from tools.docs.markdown import (
+    default_text,
+    first_line,
+    mean_and_error,
+    number_text,
+    parameter_descriptions,
+    sections,
+)
 
 ROOT = Path(__file__).parents[2]
 HEADINGS = (
@@ -51,7 +60,7 @@ HEADINGS = (
 TOP = 3
 
 
-def page(
+def environment_page(
     env_id: str, board: Mapping[str, Any] | None = None, accuracy: Mapping[str, Any] | None = None
 ) -> str:
     """Return the page of an environment.
@@ -112,15 +121,15 @@ def overview(link: Callable[[str], str]) -> str:
     rows = []
     for env_id in TASKS:
         task = TASKS[env_id]()
-        found = measured(env_id).get("measured", {})
-        best = measured(env_id).get("scale", {}).get("policy", "")
+        found = measured_entry(env_id).get("measured", {})
+        best = measured_entry(env_id).get("scale", {}).get("policy", "")
         rows.append(
             [
                 f"[{env_id}]({link(env_id)})",
                 first_line(type(task)),
                 "; ".join(_range(task, acting) for acting in task.formulas.acting),
                 *(
-                    plus_minus(row["mean"], row["error"]) if row else "not measured yet"
+                    mean_and_error(row["mean"], row["error"]) if row else "not measured yet"
                     for row in map(found.get, ("random", best))
                 ),
             ]
@@ -147,10 +156,10 @@ def _range(task: Task, acting: Any) -> str:
     """Return a control's values in words."""
     unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
     if acting.values:
-        return f"`{acting.control}` {', '.join(map(number, acting.values))} {unit}"
+        return f"`{acting.control}` {', '.join(map(number_text, acting.values))} {unit}"
     if acting.low == -acting.high:
-        return f"`{acting.control}` ±{number(acting.high)} {unit}"
-    return f"`{acting.control}` {number(acting.low)} to {number(acting.high)} {unit}"
+        return f"`{acting.control}` ±{number_text(acting.high)} {unit}"
+    return f"`{acting.control}` {number_text(acting.low)} to {number_text(acting.high)} {unit}"
 
 
 # --- parts of a page ----------------------------------------------------------------------------------------
@@ -179,7 +188,7 @@ def _summary(env_id: str, task: Task) -> str:
         ["Make it", f'`gym.make("{env_id}")`, `gym.make_vec("{env_id}", num_envs=64)`'],
         ["Action space", f"`{shown[0]}`"],
         ["Observation space", f"`{shown[1]}`"],
-        ["Step, episode", f"{number(task.dt)} s, {number(task.limit)} steps"],
+        ["Step, episode", f"{number_text(task.dt)} s, {number_text(task.limit)} steps"],
     ]
     return markdown_table(rows[0], rows[1:])
 
@@ -188,7 +197,9 @@ def _box(space: Any) -> str:
     """Return a box without its bounds if they differ; the table below has them."""
     ends = {float(x) for x in space.low}, {float(x) for x in space.high}
     if all(len(end) == 1 for end in ends):
-        return f"Box({number(ends[0].pop())}, {number(ends[1].pop())}, {space.shape}, {space.dtype})"
+        return (
+            f"Box({number_text(ends[0].pop())}, {number_text(ends[1].pop())}, {space.shape}, {space.dtype})"
+        )
     return f"Box({space.shape}, {space.dtype})"
 
 
@@ -197,7 +208,7 @@ def _actions(task: Task) -> str:
     rows = []
     for i, acting in enumerate(task.formulas.acting):
         ends = acting.values or (acting.low, acting.high)
-        values = [", ".join(map(number, ends)), ""] if acting.values else [*map(number, ends)]
+        values = [", ".join(map(number_text, ends)), ""] if acting.values else [*map(number_text, ends)]
         rows.append([str(i), f"`{acting.control}`", units[acting.control], *values])
     top = task.formulas.largest
     listed = any(acting.values for acting in task.formulas.acting)
@@ -205,7 +216,7 @@ def _actions(task: Task) -> str:
         "Num",
         "Control",
         "Unit",
-        *(("Values, by action", "") if listed else (f"At {number(-top)}", f"At {number(top)}")),
+        *(("Values, by action", "") if listed else (f"At {number_text(-top)}", f"At {number_text(top)}")),
     ]
     return markdown_table(head, rows)
 
@@ -230,9 +241,9 @@ def _bound(value: Any) -> str:
 
 def _start(task: Task) -> str:
     names = zip(task.scene.state_names, task.scene.state_units, task.centre, task.half_widths, strict=True)
-    rows = [[f"`{name}`", unit, number(centre), number(half)] for name, unit, centre, half in names]
+    rows = [[f"`{name}`", unit, number_text(centre), number_text(half)] for name, unit, centre, half in names]
     targets = task.formulas.target_boxes
-    rows += [[f"`{t.name}` (target)", t.unit, number(t.centre), number(t.half)] for t in targets]
+    rows += [[f"`{t.name}` (target)", t.unit, number_text(t.centre), number_text(t.half)] for t in targets]
     given = f'"state": [{", ".join(task.scene.state_names)}]'
     if targets:
         given += ', "target": ' + (
@@ -243,25 +254,25 @@ def _start(task: Task) -> str:
 
 
 def _end(task: Task) -> str:
-    return f"Truncation: after {number(task.limit)} steps ({number(task.duration)} s)."
+    return f"Truncation: after {number_text(task.limit)} steps ({number_text(task.duration)} s)."
 
 
 def arguments(task: Task) -> str:
     """Return the table of an environment's keywords."""
     kind = type(task.scene)
-    words = described(kind)
+    words = parameter_descriptions(kind)
     rows = []
-    for field in parameters(kind):
+    for field in keyword_fields(kind):
         unit = field.metadata.get("unit", "")
         low, high = task.usable_ranges().get(field.name, (None, None))
-        within = "" if low is None else f"{number(low)} to {number(high)}"
-        default = cell(getattr(task.scene, field.name))
+        within = "" if low is None else f"{number_text(low)} to {number_text(high)}"
+        default = default_text(getattr(task.scene, field.name))
         rows.append([f"`{field.name}`", default, unit, within, words.get(field.name, "")])
     rows += [
-        ["`dt`", number(task.dt), "s", "1e-6 to 1", "Control interval. The episode keeps its seconds."],
+        ["`dt`", number_text(task.dt), "s", "1e-6 to 1", "Control interval. The episode keeps its seconds."],
         [
             "`duration`",
-            number(task.duration),
+            number_text(task.duration),
             "s",
             "`dt` or more",
             "Length of an episode; `math.inf` for no end.",
@@ -280,7 +291,7 @@ def arguments(task: Task) -> str:
     return f"{markdown_table(['Keyword', 'Default', 'Unit', 'Range', 'Meaning'], rows)}\n\n{also}"
 
 
-def parameters(kind: type[Scene]) -> list[Any]:
+def keyword_fields(kind: type[Scene]) -> list[Any]:
     """Return the fields that are keywords of a scene."""
     complete(kind)
     return [field for field in dataclasses.fields(kind) if field.init]  # type: ignore[arg-type]
@@ -289,21 +300,21 @@ def parameters(kind: type[Scene]) -> list[Any]:
 @cache
 def _derived(kind: type[Scene], choices: tuple[tuple[str, Any], ...]) -> tuple[str, ...]:
     scene = kind(**dict(choices))
-    return equations.lagrangian(scene), *equations.equations(scene)
+    return equations.lagrangian_expression(scene), *equations.lagrange_equations(scene)
 
 
 def derivation(scene: Scene) -> str:
     """Return a scene's Lagrangian and the equations of motion that follow from it."""
-    kind, symbols = type(scene), scene._numbers()
-    choices = ((f.name, getattr(scene, f.name)) for f in parameters(kind) if f.name not in symbols)
-    lagrangian, *motion = map(equations.mathml, _derived(kind, tuple(choices)))
+    kind, symbols = type(scene), parameter_names(scene)
+    choices = ((f.name, getattr(scene, f.name)) for f in keyword_fields(kind) if f.name not in symbols)
+    lagrangian, *motion = map(equations.formula_mathml, _derived(kind, tuple(choices)))
     return "\n\n".join(["The Lagrangian, T - V:", lagrangian, "and the equations of motion:", *motion])
 
 
 def _equations(task: Task) -> str:
     text = derivation(task.scene)
-    if len(task.scene._layout.free) == 1:
-        numbers = equations.mathml(equations.with_numbers(task.scene))
+    if len(layout_of(task.scene).free) == 1:
+        numbers = equations.formula_mathml(equations.with_numbers(task.scene))
         text += f"\n\nWith the default parameters, in SI units:\n\n{numbers}"
     return text
 
@@ -318,14 +329,14 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
     speed, texts = task.certified_speed(), []
     if speed is not None and speed >= 0.0:
         order = task.scene.step_bound(task.centre, task.limit_control, task.dt).order
-        rate = f"{task.scene._layout.free[0]}_dot"
+        rate = f"{layout_of(task.scene).free[0]}_dot"
         texts.append(
             f"Stepped by a Taylor series of order {order}. One series per step is certified to have a "
             f"truncation error of at most 1e-12 rad/s as long as |`{rate}`| is at most "
             f"{math.floor(10.0 * speed) / 10.0:.1f} rad/s, whatever the control. Above that, the step is "
             "divided by the same bound."
         )
-    if task.scene._form is None:
+    if form_of(task.scene) is None:
         texts.append(
             "Stepped by Taylor series. Each comes with a proved bound on its truncation error: at most "
             f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. If that does not help, for "
@@ -336,8 +347,8 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
             texts.append(
                 "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
                 f"error of a single step is {row['one step']:.1e} of the state's size, that of an episode "
-                f"{row['whole episode']:.1e}, which is {number(row['error / rounding floor'])} times one "
-                "rounding of the start, as amplified by the system. See [Accuracy](../accuracy.md)."
+                f"{row['whole episode']:.1e}, which is {number_text(row['error / rounding floor'])} times "
+                "one rounding of the start, as amplified by the system. See [Accuracy](../accuracy.md)."
             )
     return "\n\n".join(texts)
 
@@ -352,7 +363,7 @@ def _summary_rows(accuracy: Mapping[str, Any] | None, section: str) -> list[dict
 
 
 def _returns(env_id: str) -> str:
-    found = measured(env_id)
+    found = measured_entry(env_id)
     if not found:
         return "Not measured yet."
     best = found["scale"]["policy"]
@@ -360,7 +371,7 @@ def _returns(env_id: str) -> str:
     names["optimum"] = f"the optimum: {TASKS[env_id].optimum.text}" if TASKS[env_id].optimum else ""
     names["privileged"] = f"a reference that {TASKS[env_id].open.knows}" if TASKS[env_id].open else ""
     rows = [
-        [text, plus_minus(row["mean"], row["error"]), f"{row['episodes']:,}" if "episodes" in row else ""]
+        [text, mean_and_error(row["mean"], row["error"]), f"{row['episodes']:,}" if "episodes" in row else ""]
         for name, text in names.items()
         if (row := found["measured"].get(name))
     ]
@@ -373,7 +384,7 @@ def _open(env_id: str) -> str:
     task = TASKS[env_id]
     if task.open is None:
         return ""
-    share, found = share_of_privileged(env_id), measured(env_id).get("measured", {})
+    share, found = share_of_privileged(env_id), measured_entry(env_id).get("measured", {})
     text = "**This task is open.** "
     if share is not None:
         text += (
@@ -381,7 +392,7 @@ def _open(env_id: str) -> str:
             f"{task.open.knows}. "
         )
     rows = [
-        [name, budget, plus_minus(row["mean"], row["error"]) if (row := found.get(name)) else ""]
+        [name, budget, mean_and_error(row["mean"], row["error"]) if (row := found.get(name)) else ""]
         for name, budget in task.open.tried.items()
     ]
     return f"{text}Tried so far:\n\n{markdown_table(['Method', 'Budget', 'Return'], rows)}"
@@ -392,7 +403,13 @@ def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
     if board and board["rows"]:
         ranked = [row for row in board["rows"] if row["rank"] is not None][:TOP]
         rows = [
-            [str(row["rank"]), plain(row["name"]), row["kind"], f"{row['score']:.4f}", _interval(row)]
+            [
+                str(row["rank"]),
+                plain_markdown(row["name"]),
+                row["kind"],
+                f"{row['score']:.4f}",
+                _interval(row),
+            ]
             for row in ranked
         ]
         texts += [
@@ -429,4 +446,4 @@ def pages(data: Mapping[str, Any], root: Path = ROOT, env_ids: Iterable[str] = T
     """
     accuracy = json.loads((root / "docs" / "accuracy.json").read_text(encoding="utf-8"))
     boards = {one["id"]: one for one in data["environments"] if not one["frozen"]}
-    return {env_id: page(env_id, boards.get(env_id), accuracy) for env_id in env_ids}
+    return {env_id: environment_page(env_id, boards.get(env_id), accuracy) for env_id in env_ids}

@@ -13,8 +13,10 @@ import sympy
 from latex2mathml.converter import convert
 from sympy.simplify.fu import TR10i
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene, symbolic
-from tools.docs.markdown import described, groups
+from lag_envs.scenes.derivation import layout_of
+from tools.docs.markdown import groups, parameter_descriptions
 
 #: A letter by itself, which is the symbol that a docstring gives a parameter: "Mass m of the bar."
 LETTER = re.compile(r"(?<![\w'/=])[A-Zb-zα-ωΑ-Ω](?![\w'/(=²])")
@@ -29,7 +31,7 @@ def symbol(scene: type[Scene], name: str) -> str:
     >>> symbol(PivotedBar, "com_distance"), symbol(Acrobot, "mass_1")
     ('L', 'm_{1}')
     """
-    found = LETTER.search(described(scene).get(name, ""))
+    found = LETTER.search(parameter_descriptions(scene).get(name, ""))
     if not found:
         return _word(name)
     together = [one.split("_") for one in groups(scene)[name]]
@@ -38,15 +40,15 @@ def symbol(scene: type[Scene], name: str) -> str:
     return f"{letter}_{{{','.join(own)}}}" if own else letter
 
 
-def lagrangian(scene: Scene) -> str:
+def lagrangian_expression(scene: Scene) -> str:
     """Return T - V."""
     return rf"\mathcal{{L}} = {_latex(scene, symbolic.lagrangian(scene))}"
 
 
-def equations(scene: Scene) -> list[str]:
+def lagrange_equations(scene: Scene) -> list[str]:
     """Return the equations of motion: Lagrange's, one for each free coordinate, without denominators."""
     found = []
-    for name in scene._layout.free:
+    for name in layout_of(scene).free:
         equation = _tidied(symbolic.euler_lagrange(scene, name))
         numerator = sympy.expand(sympy.fraction(sympy.together(equation))[0])
         common = sympy.Mul(*(f for f in sympy.Mul.make_args(sympy.factor_terms(numerator)) if not f.is_Add))
@@ -57,10 +59,10 @@ def equations(scene: Scene) -> list[str]:
 
 def with_numbers(scene: Scene) -> str:
     """Return the acceleration of the only free coordinate, with the scene's numbers inserted."""
-    (name,) = scene._layout.free
+    (name,) = layout_of(scene).free
     acceleration = sympy.Function(name, real=True)(symbolic.t).diff(symbolic.t, 2)
     equation = _tidied(symbolic.euler_lagrange(scene, name))
-    numbers = {s: getattr(scene, s.name) for s in equation.free_symbols if s.name in scene._numbers()}
+    numbers = {s: getattr(scene, s.name) for s in equation.free_symbols if s.name in parameter_names(scene)}
     equation = sympy.expand(equation.xreplace({s: sympy.Rational(repr(x)) for s, x in numbers.items()}))
     factor = sympy.simplify(equation.diff(acceleration))
     rest = sympy.expand(acceleration - equation / factor)
@@ -82,7 +84,7 @@ def _short(coefficient: Any) -> Any:
 
 
 def _accelerations(scene: Scene) -> list[Any]:
-    return [sympy.Function(q, real=True)(symbolic.t).diff(symbolic.t, 2) for q in scene._layout.names]
+    return [sympy.Function(q, real=True)(symbolic.t).diff(symbolic.t, 2) for q in layout_of(scene).names]
 
 
 def _latex(scene: Scene, expression: Any) -> str:
@@ -96,15 +98,15 @@ def _latex(scene: Scene, expression: Any) -> str:
         steps[step][what] = symbol = sympy.Symbol(name)
         shown[symbol] = latex
 
-    for i, name in enumerate(scene._layout.names):
+    for i, name in enumerate(layout_of(scene).names):
         place, letter = sympy.Function(name, real=True)(t), sympy.latex(sympy.Symbol(name))
         head, index, rest = letter.partition("_")
         take(0, place.diff(t, 2), f"x{i}", rf"\ddot{{{head}}}{index}{rest}")
         take(1, place.diff(t), f"w{i}", rf"\dot{{{head}}}{index}{rest}")
         take(2, place, f"v{i}", letter)
-    for i, name in enumerate(scene._layout.controls):
+    for i, name in enumerate(layout_of(scene).controls):
         take(2, sympy.Function(name, real=True)(t), f"u{i}", _word(name))
-    order = {name: i for i, name in enumerate(scene._numbers())}
+    order = {name: i for i, name in enumerate(parameter_names(scene))}
     for known in expression.free_symbols:
         if known.name in order:
             take(3, known, f"a{order[known.name]:02}", symbol(type(scene), known.name))
@@ -122,7 +124,7 @@ def _word(name: str) -> str:
     return rf"\mathrm{{{name}}}".replace("_", r"\ ")
 
 
-def mathml(latex: str, block: bool = True) -> str:
+def formula_mathml(latex: str, block: bool = True) -> str:
     """Return a formula as MathML that includes its LaTeX; a block formula can be scrolled sideways."""
     element = convert(latex, display="block" if block else "inline")
     head, body = re.fullmatch(r"(<math[^>]*>)(.*)</math>", element, re.DOTALL).groups()  # type: ignore[union-attr]

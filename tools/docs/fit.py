@@ -17,7 +17,7 @@ import numpy as np
 
 from lag_envs.scenes import Pendulum
 from lag_envs.scenes.fitting.result import Fit
-from lag_envs.store import write
+from lag_envs.store import write_file
 from tools.options import take_none
 
 ROOT = Path(__file__).parents[2]
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     take_none("python -m tools.docs.fit", __doc__, arguments)
     from agents.figures import save
 
-    write(RECORDING, recording())
+    write_file(RECORDING, recording())
     found = fitted()
     print(found)
     save(found.plot(), PICTURE)

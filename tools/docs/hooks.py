@@ -43,7 +43,7 @@ def generated() -> dict[str, str]:
         f"{ENVIRONMENTS}/{env_id}.md": text for env_id, text in environments.pages(board(), ROOT).items()
     }
     found[f"{ENVIRONMENTS}/index.md"] = environments.index()
-    found["scenes.md"] = scenes.page()
+    found["scenes.md"] = scenes.scenes_page()
     return found
 
 
@@ -119,15 +119,15 @@ def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     """Add what link previews show, and a name for the search."""
-    return named(output.replace("</head>", f"{preview(page, config)}</head>", 1))
+    return with_search_name(output.replace("</head>", f"{preview(page, config)}</head>", 1))
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
     """Name the search also in pages that are not in the navigation, such as 404.html."""
-    return named(output_content)
+    return with_search_name(output_content)
 
 
-def named(html: str) -> str:
+def with_search_name(html: str) -> str:
     """Return a page whose search has a name for screen readers; the theme leaves it without one."""
     search = 'data-md-component="search" role="dialog"'
     return html.replace(search, f'{search} aria-label="Search"')

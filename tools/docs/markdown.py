@@ -19,7 +19,7 @@ def sections(kind: type) -> dict[str, str]:
     return dict(zip(["", *parts[1::2]], (part.strip() for part in parts[::2]), strict=True))
 
 
-def number(value: float) -> str:
+def number_text(value: float) -> str:
     """Return a number as people write it.
 
     Examples
@@ -34,7 +34,7 @@ def number(value: float) -> str:
     )
 
 
-def plus_minus(mean: float, error: float) -> str:
+def mean_and_error(mean: float, error: float) -> str:
     """Return a mean with its standard error, which decides the digits.
 
     Examples
@@ -46,7 +46,7 @@ def plus_minus(mean: float, error: float) -> str:
     return f"{mean:.{min(digits, 6)}f} ± {error:.{min(digits, 6)}f}"
 
 
-def described(kind: type) -> dict[str, str]:
+def parameter_descriptions(kind: type) -> dict[str, str]:
     """Return a numpydoc docstring's description of each parameter."""
     text = inspect.getdoc(kind) or ""
     block = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
@@ -69,6 +69,6 @@ def groups(kind: type) -> dict[str, list[str]]:
     return found
 
 
-def cell(value: Any) -> str:
+def default_text(value: Any) -> str:
     """Return a default value as people type it."""
-    return number(value) if isinstance(value, float) else repr(value)
+    return number_text(value) if isinstance(value, float) else repr(value)

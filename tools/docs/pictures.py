@@ -22,7 +22,7 @@ GOOD = 0.8
 CHOICES = ((480, 60, 1), (480, 40, 1), (400, 40, 1), (360, 30, 1), (360, 30, 2), (320, 20, 3))
 
 
-def draw(board: Path, folder: Path, envs: Collection[str]) -> None:
+def draw_environments(board: Path, folder: Path, envs: Collection[str]) -> None:
     """Draw environments of a board: the best learned agent if it is good, otherwise the best of all."""
     folder.mkdir(parents=True, exist_ok=True)
     for found in board_data(Board(board))["environments"]:
@@ -31,7 +31,7 @@ def draw(board: Path, folder: Path, envs: Collection[str]) -> None:
         if not found["frozen"] and rows and found["id"] in envs:
             row = (learned or rows)[0]
             path = folder / f"{found['id']}.webp"
-            write(path, *frames(found["id"], row["replays"][0]))
+            write_animation(path, *frames(found["id"], row["replays"][0]))
             print(f"{path.name}: {row['name']}, {path.stat().st_size:,} bytes")
 
 
@@ -53,7 +53,7 @@ def frames(env_id: str, replay: Mapping[str, Any]) -> tuple[list[Image.Image], f
     return pictures, every * task.dt
 
 
-def write(path: Path, pictures: list[Image.Image], seconds: float) -> None:
+def write_animation(path: Path, pictures: list[Image.Image], seconds: float) -> None:
     """Write an animation that loops, in the best quality that fits the size limit."""
     for width, quality, every in CHOICES:
         size = width, round(pictures[0].height * width / pictures[0].width)

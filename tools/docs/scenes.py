@@ -6,14 +6,15 @@ import inspect
 import re
 import sys
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES, Scene
 from lag_envs.tables import markdown_table
-from tools.docs.environments import derivation, parameters
-from tools.docs.equations import mathml, symbol
-from tools.docs.markdown import cell, described, first_line
+from tools.docs.environments import derivation, keyword_fields
+from tools.docs.equations import formula_mathml, symbol
+from tools.docs.markdown import default_text, first_line, parameter_descriptions
 
 
-def page() -> str:
+def scenes_page() -> str:
     """Return the page."""
     parts = [
         "# Scenes",
@@ -39,11 +40,15 @@ def _row(kind: type[Scene]) -> list[str]:
 
 
 def _scene(kind: type[Scene]) -> list[str]:
-    scene, words = kind(), described(kind)
+    scene, words = kind(), parameter_descriptions(kind)
     rows = []
-    for field in parameters(kind):
-        letter = mathml(symbol(kind, field.name), block=False) if field.name in scene._numbers() else ""
-        default = cell(getattr(scene, field.name))
+    for field in keyword_fields(kind):
+        letter = (
+            formula_mathml(symbol(kind, field.name), block=False)
+            if field.name in parameter_names(scene)
+            else ""
+        )
+        default = default_text(getattr(scene, field.name))
         rows.append(
             [f"`{field.name}`", letter, default, field.metadata.get("unit", ""), words.get(field.name, "")]
         )

@@ -147,7 +147,7 @@ def run(name: str, number: int, entry: dict[str, Any], programs: Path) -> float:
     for file_name, text in scripts(entry).items():
         (folder / file_name).write_text(text)
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    environment |= QUIET | {"HOME": str(folder), "OURS": str(HERE)}
+    environment |= QUIET | {"HOME": str(folder), "SCRIPTS": str(HERE)}
     environment["PATH"] = f"{programs}{os.pathsep}{environment['PATH']}"
     output = folder / "output.txt"
     started = time.perf_counter()

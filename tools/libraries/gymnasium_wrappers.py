@@ -128,10 +128,10 @@ VECTOR = {
 OTHER_ARRAYS = ("ArrayConversion", "NumpyToTorch", "JaxToTorch")
 
 
-def listed(module, ours):
+def listed(module, recipes):
     """Return the names of a module's wrappers; exit with an error if they differ from our list."""
     names = [n for n in module.__all__ if isinstance(getattr(module, n), type) and n not in ELSEWHERE]
-    unknown, gone = sorted(set(names) - set(ours)), sorted(set(ours) - set(names))
+    unknown, gone = sorted(set(names) - set(recipes)), sorted(set(recipes) - set(names))
     if unknown or gone:
         sys.exit(f"wrappers that are not listed here: {unknown}; that Gymnasium lacks: {gone}")
     return names
@@ -159,9 +159,9 @@ def play_episodes(env, tensors):
 
 def wrappers(kind):
     """Step every environment inside every wrapper, vector ones in all autoreset modes."""
-    module, ours = (single, SINGLE) if kind == "single" else (vector, VECTOR)
-    names = listed(module, ours)
-    theirs = set()
+    module, recipes = (single, SINGLE) if kind == "single" else (vector, VECTOR)
+    names = listed(module, recipes)
+    known_failures = set()
     for env_id in lag_envs.TASKS:
         for name in names:
             # JAX compiles for a second, so one environment has to do.
@@ -170,22 +170,26 @@ def wrappers(kind):
             tensors = name in OTHER_ARRAYS
             options = {"render_mode": "rgb_array", "duration": 1.0}
             if kind == "single":
-                play_episodes(ours[name](gym.make(env_id, **options)), tensors)
+                play_episodes(recipes[name](gym.make(env_id, **options)), tensors)
                 continue
             for mode in AutoresetMode:
                 try:
                     envs = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, **options)
-                    play_episodes(ours[name](envs), tensors)
+                    play_episodes(recipes[name](envs), tensors)
                 except Exception as error:
-                    if not fails_alike(error, ours[name], mode, tensors):
+                    if not fails_alike(error, recipes[name], mode, tensors):
                         raise
-                    theirs.add(f"{name}, {mode.value}: {type(error).__name__}, as around Pendulum-v1")
+                    known_failures.add(f"{name}, {mode.value}: {type(error).__name__}, as around Pendulum-v1")
     print(f"{len(names)} wrappers around {len(lag_envs.TASKS)} environments")
-    print(*sorted(theirs), *(f"{n}: {why}" for n, why in ELSEWHERE.items() if n in module.__all__), sep="\n")
+    print(
+        *sorted(known_failures),
+        *(f"{n}: {why}" for n, why in ELSEWHERE.items() if n in module.__all__),
+        sep="\n",
+    )
 
 
 def fails_alike(error, wrapper, mode, tensors):
-    """Tell whether Gymnasium's own Pendulum-v1 fails inside a wrapper in the same way."""
+    """Return whether Gymnasium's own Pendulum-v1 fails inside a wrapper in the same way."""
     try:
         envs = gym.make_vec(
             "Pendulum-v1", 3, "sync", vector_kwargs={"autoreset_mode": mode}, render_mode="rgb_array",

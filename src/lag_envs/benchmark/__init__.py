@@ -1,4 +1,4 @@
-"""Speed beside other environments, and the time to a first step; the command ``lag-envs bench``.
+"""Speed compared with other environments, and the time to a first step; the command ``lag-envs bench``.
 
 All contestants are measured in one process on one core, in turn, round after round, and compared within each
 round, so that a slow phase of the machine affects all of them. A sample is a loop over actions made

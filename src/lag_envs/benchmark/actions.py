@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
-    """Return batches of shape (n, 1), uniform in [-scale, scale]: enough that they do not repeat too soon.
+    """Return batches of shape (n, 1), uniform in [-scale, scale]; there are enough not to repeat too soon.
 
     A few batches repeated over and over would act as a periodic force, which drives pendulums into resonance,
     to speeds at which steps are divided.

@@ -36,5 +36,5 @@ class ChainSwing(Task):
         return height - 0.1 * after.s**2
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the support has left its track."""
+        """Return whether the support has left its track."""
         return xp.abs(after.s) > 2.4

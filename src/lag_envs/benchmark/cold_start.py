@@ -70,7 +70,7 @@ def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
     return [total - sum(stages), *stages]
 
 
-def summary(times: Sequence[Sequence[float]]) -> dict[str, Any]:
+def start_summary(times: Sequence[Sequence[float]]) -> dict[str, Any]:
     """Return the seconds of each process, their median, and that of each of `STAGES`."""
     seconds = [sum(stages) for stages in times]
     parts = zip(STAGES, zip(*times, strict=True), strict=True)

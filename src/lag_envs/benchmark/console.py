@@ -6,7 +6,7 @@ from typing import Any
 
 from lag_envs.benchmark import divisions, jacobians
 from lag_envs.benchmark.results import quartiles, times_of
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 
 def table(report: dict[str, Any]) -> list[str]:
@@ -31,7 +31,7 @@ def table(report: dict[str, Any]) -> list[str]:
             "x CartPole",
             "(quartiles)",
         )
-        lines += columns([head, *map(_cells, report["rows"])])
+        lines += aligned([head, *map(_cells, report["rows"])])
         lines += [
             "",
             "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
@@ -39,28 +39,28 @@ def table(report: dict[str, Any]) -> list[str]:
         ]
     if found := report.get("speedups"):
         names = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
-        lines += [*columns([names, *map(_compared, found)]), ""]
+        lines += [*aligned([names, *map(_compared, found)]), ""]
     if found := report.get("arithmetic"):
         titles = ("environment", "envs", "products a step", "of the core's peak", "(quartiles)")
-        lines += [*columns([titles, *map(_share, found)]), ""]
+        lines += [*aligned([titles, *map(_share, found)]), ""]
     if found := report.get("chains"):
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     if costs := report.get("jacobians"):
-        lines += [*columns(jacobians.table(costs)), ""]
+        lines += [*aligned(jacobians.table(costs)), ""]
     if costs := report.get("backwards"):
-        lines += [*columns(jacobians.backwards_table(costs)), ""]
+        lines += [*aligned(jacobians.backwards_table(costs)), ""]
     if found := report.get("divisions"):
-        rows = [divisions.cells(row, times_of(report).get(row["id"])) for row in found]
-        lines += [*columns([divisions.HEAD, *rows]), ""]
+        rows = [divisions.table_row(row, times_of(report).get(row["id"])) for row in found]
+        lines += [*aligned([divisions.HEAD, *rows]), ""]
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
         lines += [f"cold start, cache {name}: {middle:.2f} s {spread}; median of each stage, ms:"]
         rows = [(f"  {stage}", f"{1e3 * seconds:.1f}") for stage, seconds in cold["stages"].items()]
-        lines += [*columns(rows), ""]
+        lines += [*aligned(rows), ""]
     words = {True: "met", False: "missed", None: "not measured"}
-    lines += columns([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
+    lines += aligned([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
     if not report["complete"]:
         lines += ["", "interrupted: these are the samples so far"]
     return lines

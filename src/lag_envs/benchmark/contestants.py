@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from lag_envs.benchmark.environments import made, ours, unwrapped
+from lag_envs.benchmark.environments import as_users_make_it, own_vector, unwrapped
 from lag_envs.benchmark.peak import NUMBERS, peak
 from lag_envs.benchmark.peers import PEERS
 from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant
@@ -19,18 +19,20 @@ def contestants(
     """Return our environments, also with other keywords and several threads, and the peers."""
     rows = []
     for id in ids:
-        rows += [Contestant("lag_envs", id, "made", 1, partial(made, id))]
+        rows += [Contestant("lag_envs", id, "made", 1, partial(as_users_make_it, id))]
         rows += [Contestant("lag_envs", id, "unwrapped", 1, partial(unwrapped, id))]
-        rows += [Contestant("lag_envs", id, "vector", n, partial(ours, id, n)) for n in sizes]
+        rows += [Contestant("lag_envs", id, "vector", n, partial(own_vector, id, n)) for n in sizes]
         if threads > 1:
-            shared = partial(ours, id, num_threads=threads)
+            shared = partial(own_vector, id, num_threads=threads)
             rows += [Contestant(THREADED, id, "vector", n, partial(shared, n)) for n in sizes]
         for text in keywords:
             given, name = keywords_of(text), f"{id}, {text}"
             rows += [Contestant(VARIED, name, "unwrapped", 1, partial(unwrapped, id, **given))]
-            rows += [Contestant(VARIED, name, "vector", n, partial(ours, id, n, **given)) for n in sizes]
+            rows += [
+                Contestant(VARIED, name, "vector", n, partial(own_vector, id, n, **given)) for n in sizes
+            ]
     for id in ("CartPole-v1", "Pendulum-v1"):
-        rows += [Contestant("gymnasium", id, "made", 1, partial(made, id))]
+        rows += [Contestant("gymnasium", id, "made", 1, partial(as_users_make_it, id))]
     rows += [Contestant(CORE, "multiply-adds", "arithmetic", NUMBERS, peak)]
     for library, id, prepare in PEERS:
         rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]

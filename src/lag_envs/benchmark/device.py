@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from lag_envs.device import DeviceEnvs
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 #: Numbers copied to measure the memory, more than any cache holds.
 COPIED = 2**28
@@ -25,7 +25,7 @@ COPIED = 2**28
 FLAGS = 4 + 4 + 3
 
 
-class Rate(NamedTuple):
+class DeviceRate(NamedTuple):
     """Measurement of one environment.
 
     Attributes
@@ -51,7 +51,7 @@ class Rate(NamedTuple):
 
 def rates(
     ids: Sequence[str], sizes: Sequence[int], device: str | torch.device, seconds: float, rounds: int
-) -> list[Rate]:
+) -> list[DeviceRate]:
     """Measure environments on a GPU, in single and in double precision.
 
     Parameters
@@ -73,7 +73,7 @@ def rates(
         envs = DeviceEnvs(env_id, size, device, dtype, autoreset_mode="SameStep")
         envs.reset(seed=0)
         steps = size * _calls_a_second(_stepping(envs), envs.device, seconds, rounds)
-        found.append(Rate(env_id, dtype, size, steps, steps * traffic(envs) / bandwidth))
+        found.append(DeviceRate(env_id, dtype, size, steps, steps * traffic(envs) / bandwidth))
     return found
 
 
@@ -85,14 +85,14 @@ def traffic(envs: DeviceEnvs) -> int:
     return number * (2 * kept + actions + 1) + 2 * 4 * seen + FLAGS
 
 
-def table(found: Sequence[Rate]) -> str:
+def table(found: Sequence[DeviceRate]) -> str:
     """Return the measurements as text."""
     head = ("environment", "precision", "environments", "steps/s", "share of memory's rate")
     rows = [
         (r.id, str(r.dtype).removeprefix("torch."), f"{r.num_envs:,}", f"{r.steps:.3g}", f"{r.share:.0%}")
         for r in found
     ]
-    return "\n".join(columns([head, *rows]))
+    return "\n".join(aligned([head, *rows]))
 
 
 def _bandwidth(device: str | torch.device, seconds: float, rounds: int) -> float:

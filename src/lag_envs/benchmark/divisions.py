@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 
@@ -40,7 +41,7 @@ def divisions(ids: Sequence[str]) -> list[dict[str, Any]]:
 def _divided(env_id: str) -> dict[str, Any]:
     envs: Any = gym.make_vec(env_id, BATCH, autoreset_mode="SameStep").unwrapped
     scene, dt, limit = envs.scene, envs.task.dt, int(envs.task.limit)
-    fast = [i for i, entry in enumerate(scene._layout.state) if entry.kind != "place"]
+    fast = [i for i, entry in enumerate(layout_of(scene).state) if entry.kind != "place"]
     envs.reset(seed=0)
     envs.action_space.seed(0)
     parts: list[int] = []
@@ -66,14 +67,14 @@ def _divided(env_id: str) -> dict[str, Any]:
 HEAD = ("id", "series a step", "most", "steps that are divided", "fastest [1/s]", "time of a series")
 
 
-def cells(row: Mapping[str, Any], nanoseconds: float | None) -> tuple[str, ...]:
+def table_row(row: Mapping[str, Any], nanoseconds: float | None) -> tuple[str, ...]:
     """Return a line of the table; `nanoseconds` is the time of a step, if it was measured."""
     each = "" if nanoseconds is None else f"{nanoseconds / row['mean']:,.0f} ns"
     share = f"{100.0 * row['divided']:.0f} %"
     return row["id"], f"{row['mean']:.2f}", str(row["most"]), share, f"{row['fastest']:.1f}", each
 
 
-def markdown(rows: Sequence[Mapping[str, Any]], times: Mapping[str, float]) -> str:
+def divisions_markdown(rows: Sequence[Mapping[str, Any]], times: Mapping[str, float]) -> str:
     """Return the table of environments with divided steps, with the times of their steps [ns]."""
-    lines = [cells(row, times.get(row["id"])) for row in rows if row["most"] > 1]
+    lines = [table_row(row, times.get(row["id"])) for row in rows if row["most"] > 1]
     return markdown_table(list(HEAD), [list(line) for line in lines])

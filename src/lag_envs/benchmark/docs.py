@@ -9,36 +9,36 @@ from typing import Any
 
 from lag_envs.benchmark import divisions
 from lag_envs.benchmark.results import times_of
-from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, SpeedTarget, has_own_flow, reached
+from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, SpeedTarget, has_own_flow, reached_targets
 from lag_envs.generated import replaced
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
 
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
     """Write a report into a checkout: ``docs/speed.json``, and its texts in docs/speed.md and README."""
-    write(checkout / "docs" / "speed.json", to_json(report))
+    write_file(checkout / "docs" / "speed.json", report_json(report))
     for path, text in texts(report, checkout).items():
-        write(path, text)
+        write_file(path, text)
 
 
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
     """Return the files of a checkout with a report's texts, as they should be."""
     page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
-    text = replaced(page.read_text(encoding="utf-8"), "bench", markdown(report))
+    text = replaced(page.read_text(encoding="utf-8"), "bench", speed_markdown(report))
     return {
         page: replaced(text, "fast", claim(report)),
         readme: replaced(readme.read_text(encoding="utf-8"), "fast", claim(report)),
     }
 
 
-def to_json(report: dict[str, Any]) -> str:
+def report_json(report: dict[str, Any]) -> str:
     """Return a report as JSON, with lists of numbers on a line."""
     text = json.dumps(report, indent=1, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
-def markdown(report: dict[str, Any]) -> str:
+def speed_markdown(report: dict[str, Any]) -> str:
     """Return the table of docs/speed.md: every environment at the sizes of `TARGETS`; misses are marked.
 
     Parameters
@@ -85,7 +85,7 @@ def markdown(report: dict[str, Any]) -> str:
             "time of one, many at once. Other environments never needed more than one; those with "
             "imperfections were left out."
         )
-        parts.append(divisions.markdown(found, times_of(report)))
+        parts.append(divisions.divisions_markdown(found, times_of(report)))
     if cold := report["cold_start"]:
         starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
         parts.append(f"A whole process (import, make, reset, first step) took {starts}.")
@@ -104,18 +104,18 @@ def _of_series(rows: list[dict[str, Any]], target: SpeedTarget) -> str:
 
 def claim(report: dict[str, Any]) -> str:
     """Return README's summary of speed: the ranges of the table, and how many targets are missed."""
-    ours = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
+    own_rows = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
     kinds = {"a flow of their own": True, "the general series, or imperfections": False}
     lines = [
         [name, *(_range(some, target) for target in TARGETS)]
         for name, own in kinds.items()
-        if (some := [row for row in ours if has_own_flow(row["id"]) is own])
+        if (some := [row for row in own_rows if has_own_flow(row["id"]) is own])
     ]
     places = ["alone", *(f"{target.num_envs:,} at once" for target in TARGETS[1:])]
     missed = [
         ratio < target.ratio
         for target in (*TARGETS, *SERIES_TARGETS)
-        for ratio in reached(report["rows"], target).values()
+        for ratio in reached_targets(report["rows"], target).values()
     ]
     aims = f"{sum(missed)} of {len(missed)} targets are missed" if any(missed) else "All targets are met"
     return (

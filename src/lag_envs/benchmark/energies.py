@@ -1,4 +1,4 @@
-"""Scenes defined by energies alone, beside Gymnasium's CartPole."""
+"""Scenes defined by energies alone, compared with Gymnasium's CartPole."""
 
 from __future__ import annotations
 

@@ -14,17 +14,17 @@ from lag_envs.benchmark.actions import actions_of
 from lag_envs.benchmark.rounds import Run
 
 
-def made(id: str) -> Run:
+def as_users_make_it(id: str) -> Run:
     """Prepare one environment as users make it, in Gymnasium's default wrappers."""
-    return single(gym.make(id))
+    return own_single(gym.make(id))
 
 
 def unwrapped(id: str, **keywords: Any) -> Run:
     """Prepare one environment without wrappers."""
-    return single(gym.make(id, **keywords).unwrapped)
+    return own_single(gym.make(id, **keywords).unwrapped)
 
 
-def single(env: gym.Env) -> Run:
+def own_single(env: gym.Env) -> Run:
     """Prepare one environment with Gymnasium's interface."""
     # A choice as Python's int, as users give it.
     endless = cycle([a[0].item() if a.ndim == 1 else a[0] for a in actions_of(env.action_space, 1)])
@@ -40,13 +40,13 @@ def single(env: gym.Env) -> Run:
     return run
 
 
-def ours(id: str, n: int, **keywords: Any) -> Run:
+def own_vector(id: str, n: int, **keywords: Any) -> Run:
     """Prepare a native vector environment, with one thread unless stated otherwise."""
     return stepped(gym.make_vec(id, num_envs=n, **{"num_threads": 1} | keywords))
 
 
 def stepped(envs: VectorEnv) -> Run:
-    """Prepare a vector environment of ours."""
+    """Prepare a vector environment of this package."""
     actions = actions_of(envs.single_action_space, envs.num_envs)
     envs.reset(seed=0)
     stagger_episodes(envs, actions)

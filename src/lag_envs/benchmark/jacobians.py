@@ -16,6 +16,7 @@ from lag_envs import scenes
 from lag_envs.envs.model import Model
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.scenes import Scene
+from lag_envs.scenes.derivation import code_of, form_of, motion_constants_of, step_argument_of
 from lag_envs.stepping.compiling import compile_function
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.tasks import TASKS
@@ -42,10 +43,10 @@ CASES: dict[str, Callable[[], Scene]] = {
 
 def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
     """Return a function that takes a step from each of many states, and returns the sum of the results."""
-    code, constants = scene._code(dt), scene._constants()
+    code, constants = code_of(scene, dt), motion_constants_of(scene)
     numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-    general, n = scene._form is None, len(scene.state_names)
-    angle = None if scene._form is None else scene._form.angle
+    form, n = form_of(scene), len(scene.state_names)
+    general, angle = form is None, None if form is None else form.angle
     held = ["order" if general else "x", *code.constants]
     call = [*(["rows"] if general else []), *code.start, *code.controls, "dt", *held]
     loop = [
@@ -64,7 +65,7 @@ def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
         "return total",
     ]
     steps = compile_function("steps", "\n    ".join(body) + "\n", code.compile())
-    limit = scene._limit(dt)
+    limit = step_argument_of(scene, dt)
     return lambda states, controls: steps(states, controls, dt, limit, *numbers)
 
 

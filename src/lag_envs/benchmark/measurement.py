@@ -12,14 +12,14 @@ from lag_envs.benchmark import cold_start
 from lag_envs.benchmark.console import table
 from lag_envs.benchmark.contestants import contestants
 from lag_envs.benchmark.divisions import divisions
-from lag_envs.benchmark.docs import take_over, to_json
+from lag_envs.benchmark.docs import report_json, take_over
 from lag_envs.benchmark.energies import chains, of_energies
 from lag_envs.benchmark.jacobians import backwards, jacobians
 from lag_envs.benchmark.peak import arithmetic
-from lag_envs.benchmark.results import speedups, summary
-from lag_envs.benchmark.rounds import CLOCKS, measure
+from lag_envs.benchmark.results import row_summary, speedups
+from lag_envs.benchmark.rounds import CLOCKS, measure_rates
 from lag_envs.benchmark.targets import verdicts
-from lag_envs.host import installed, machine
+from lag_envs.host import installed_versions, machine
 from lag_envs.own_files import registered
 from lag_envs.tasks import TASKS
 
@@ -27,7 +27,7 @@ LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "ja
 
 
 @dataclass
-class Settings:
+class BenchmarkSettings:
     """Contents and length of a measurement."""
 
     ids: tuple[str, ...] = tuple(TASKS)
@@ -37,7 +37,7 @@ class Settings:
     jacobians: bool = False  #: also the cost of a step's derivatives
     divisions: bool = False  #: also how often the certificate divides steps
     sizes: tuple[int, ...] = (1, 64, 1024, 16384)
-    threads: int = 1  #: if more than 1, also batches stepped by so many
+    threads: int = 1  #: if more than 1, also batches stepped by this many
     rounds: int = 31
     seconds: float = 0.05  #: target length of one sample
     clock: str = "wall"  #: or "cpu", which leaves out the time of other programs on the core
@@ -48,26 +48,26 @@ class Settings:
     checkout: str | None = None  #: docs to write the result into
 
 
-def bench(settings: Settings) -> dict[str, Any]:
+def bench(settings: BenchmarkSettings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return its contents."""
     for name in settings.files:
         registered(name)
-    ours = settings.ids, settings.sizes, settings.keywords, settings.threads
-    rows = contestants(*ours) if settings.speed else []
+    selection = settings.ids, settings.sizes, settings.keywords, settings.threads
+    rows = contestants(*selection) if settings.speed else []
     if settings.speed and settings.energies:
         rows += of_energies(settings.sizes)
     times: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
+    complete = measure_rates(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
     if complete and settings.cold_starts:
         complete = cold_start.cold_starts(settings.ids[0], settings.cold_starts, times, settings.files)
-    cold = {cache: cold_start.summary(some) for cache, some in times.items()}
-    results = [summary(row, rows) for row in rows]
+    cold = {cache: cold_start.start_summary(some) for cache, some in times.items()}
+    results = [row_summary(row, rows) for row in rows]
     report: dict[str, Any] = {
         "date": settings.date,
         "complete": complete,
         "machine": machine() | {"load_at_start": load},
-        "versions": {"lag_envs": lag_envs.__version__} | installed(LIBRARIES),
+        "versions": {"lag_envs": lag_envs.__version__} | installed_versions(LIBRARIES),
         "settings": asdict(settings),
         "rows": results,
         "cold_start": cold,
@@ -83,7 +83,7 @@ def bench(settings: Settings) -> dict[str, Any]:
         report["divisions"] = divisions(settings.ids)
     print("\n".join(table(report)))
     if settings.output:
-        Path(settings.output).write_text(to_json(report), encoding="utf-8")
+        Path(settings.output).write_text(report_json(report), encoding="utf-8")
         print(f"written to {settings.output}")
     if settings.checkout and complete:
         take_over(report, Path(settings.checkout))

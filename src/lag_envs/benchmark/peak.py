@@ -15,11 +15,14 @@ import numpy as np
 
 from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import CORE, Contestant
+from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
 from lag_envs.stepping.compiling import compile_function, count_operations
 
-#: Numbers, few enough for the nearest cache, and multiply-adds on each: enough that loads do not matter.
+#: How many numbers, few enough for the nearest cache, and multiply-adds on each, so many that loads do not
+#: matter.
 NUMBERS, TIMES = 1024, 12
 PRODUCTS = frozenset({"*", "a*b+c", "a*b-c", "c-a*b"})
 
@@ -39,7 +42,7 @@ def _compiled() -> Callable:
 
 
 def peak() -> Callable[[int], int]:
-    """Return a function that does at least so many multiply-adds on each number and returns their number."""
+    """Return a function that does at least this many multiply-adds on each number, and counts them."""
     multiply_adds, numbers = _compiled(), on_a_line(np.ones(NUMBERS))
 
     def run(count: int) -> int:
@@ -68,7 +71,10 @@ def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
     largest = {r.id: r for r in sorted(batches, key=lambda r: r.num_envs)}
     found = []
     for id, row in largest.items():
-        count = products(gym.make_vec(id, num_envs=1)._program) if row.rates else None  # type: ignore[attr-defined]
+        count = None
+        if row.rates:
+            task: Any = gym.make_vec(id, num_envs=1).unwrapped.task  # type: ignore[attr-defined]
+            count = products(program_of(task, [numbers_of(task)]))
         if count and (pairs := ratios(row.rates, limits)):
             share = quartiles([count * pair for pair in pairs])
             found.append({"id": id, "num_envs": row.num_envs, "products": count, "share": share})

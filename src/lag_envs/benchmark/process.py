@@ -11,11 +11,11 @@ import warnings
 from dataclasses import asdict
 from typing import Any
 
-from lag_envs.benchmark.measurement import Settings, bench
+from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.host import ONE_THREAD
 
 
-def in_own_process(settings: Settings) -> int:
+def in_own_process(settings: BenchmarkSettings) -> int:
     """Run `bench` in a separate process, on as many cores as it has threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark.process", json.dumps(asdict(settings))]
     child = subprocess.Popen(command, env=os.environ | ONE_THREAD)
@@ -43,7 +43,7 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _break_off)
     warnings.simplefilter("ignore")  # from the peers
-    settings = Settings(**json.loads(sys.argv[1]))
+    settings = BenchmarkSettings(**json.loads(sys.argv[1]))
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-settings.threads :])
     report = bench(settings)

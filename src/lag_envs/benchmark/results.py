@@ -33,7 +33,7 @@ def ratios(rates: Sequence[float], others: Sequence[float]) -> list[float]:
     return [a / b for a, b in zip(rates, others, strict=False)]
 
 
-def summary(row: Contestant, rows: Sequence[Contestant]) -> dict[str, Any]:
+def row_summary(row: Contestant, rows: Sequence[Contestant]) -> dict[str, Any]:
     """Return a row with its statistics, and its ratio to CartPole-v1 at the same size."""
     kind = "vector" if row.kind == "vector" else "made"
     rival = [

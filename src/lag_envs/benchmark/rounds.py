@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from lag_envs.progress import progress
 
-#: Takes at least so many steps of every environment, and returns how many it took.
+#: Takes at least this many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
 Clock = Callable[[], float]
 CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -37,7 +37,7 @@ ENERGIES, VARIED, THREADED = "lag_envs, energies", "lag_envs, varied", "lag_envs
 CORE = "this core"
 
 
-def measure(
+def measure_rates(
     rows: Sequence[Contestant], rounds: int, seconds: float, clock: Clock = time.perf_counter
 ) -> bool:
     """Fill in the contestants' rates; return False if the user interrupted it, keeping the rates so far."""
@@ -62,7 +62,7 @@ def measure(
 
 @contextmanager
 def excused(row: Contestant) -> Iterator[None]:
-    """Record a contestant's error in its row, so that the others can go on."""
+    """Record a contestant's error in its row, so that the others can continue."""
     try:
         yield
     except Exception as error:

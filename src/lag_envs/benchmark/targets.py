@@ -1,4 +1,4 @@
-"""The ratios and times that ours should reach, and whether they do."""
+"""The ratios and times that this package should reach, and whether it does."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from lag_envs.benchmark.results import quartiles
 from lag_envs.benchmark.rounds import ENERGIES
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks import TASKS
 
 
@@ -29,7 +30,7 @@ class SpeedTarget(NamedTuple):
         return size if self.id is None else f"{self.id}, {size}"
 
     def meant_for(self, row: dict[str, Any]) -> bool:
-        """Tell whether the target applies to a row of a report."""
+        """Return whether the target applies to a row of a report."""
         if (row["kind"], row["num_envs"]) != (self.kind, self.num_envs):
             return False
         if self.id is not None:
@@ -55,11 +56,11 @@ COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
 @cache
 def has_own_flow(env_id: str) -> bool:
-    """Tell whether an environment is stepped by its scene's dedicated flow alone."""
-    return env_id in TASKS and not TASKS[env_id].imperfections and TASKS[env_id]().scene._form is not None
+    """Return whether an environment is stepped by its scene's dedicated flow alone."""
+    return env_id in TASKS and not TASKS[env_id].imperfections and form_of(TASKS[env_id]().scene) is not None
 
 
-def reached(rows: Sequence[dict[str, Any]], target: SpeedTarget) -> dict[str, float]:
+def reached_targets(rows: Sequence[dict[str, Any]], target: SpeedTarget) -> dict[str, float]:
     """Return the median ratio of each row that should reach a target."""
     return {row["id"]: row["ratio"][1] for row in rows if "ratio" in row and target.meant_for(row)}
 
@@ -68,7 +69,7 @@ def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> li
     """Compare the measurements with the targets; ``met`` is None if nothing was measured."""
     results = []
     for target in (*TARGETS, *SERIES_TARGETS):
-        measured = reached(rows, target)
+        measured = reached_targets(rows, target)
         met = all(value >= target.ratio for value in measured.values()) if measured else None
         goal = f"{target}: at least {target.ratio:g} x CartPole-v1"
         results.append({"target": goal, "limit": target.ratio, "met": met, "measured": measured})

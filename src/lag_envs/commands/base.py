@@ -29,7 +29,7 @@ class Command(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
-def known(id: str) -> str:
+def known_id(id: str) -> str:
     """Return the id, or raise a UserError that names similar ones."""
     if id in TASKS:
         return id

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, declare_date, known, needs, seconds
+from lag_envs.commands.base import OWN, Command, count, declare_date, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.own_files import is_file
@@ -79,7 +79,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
 
 def run_bench(args: argparse.Namespace) -> int:
     """Compare speeds."""
-    from lag_envs.benchmark.measurement import Settings
+    from lag_envs.benchmark.measurement import BenchmarkSettings
     from lag_envs.benchmark.process import in_own_process
 
     ids, files = _measured(args.ids)
@@ -123,7 +123,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "output": args.output,
         "checkout": args.checkout,
     }
-    return in_own_process(Settings(**(quick | given | plain)))
+    return in_own_process(BenchmarkSettings(**(quick | given | plain)))
 
 
 def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
@@ -152,7 +152,7 @@ def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     files = tuple(dict.fromkeys(name for name in names if is_file(name)))
     ids: list[str] = []
     for name in names:
-        ids += own_files.registered(name) if name in files else [known(name)]
+        ids += own_files.registered(name) if name in files else [known_id(name)]
     return tuple(dict.fromkeys(ids)), files
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lag_envs.commands.base import Command
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 
 def declare_cache(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def run_cache(args: argparse.Namespace) -> int:
     if args.clear:
         print(f"{place}: {cache.clear(place)} files removed")
         return 0
-    kept = cache.entries(place)
+    kept = cache.cache_files(place)
     size = sum(entry.size for entry in kept)
     rows = [
         ("folder", str(place)),
@@ -33,8 +33,8 @@ def run_cache(args: argparse.Namespace) -> int:
         ("writable", "yes" if cache.writable(place) else "no: each process compiles what is not here"),
     ]
     damaged = [(str(entry.path), why) for entry in kept if (why := cache.damage(entry.path))]
-    rows += [("damaged", str(len(damaged)) + (", compiled anew when used next:" if damaged else ""))]
-    print("\n".join(columns(rows) + columns([("  " + path, why) for path, why in damaged])))
+    rows += [("damaged", str(len(damaged)) + (", compiled again when used next:" if damaged else ""))]
+    print("\n".join(aligned(rows) + aligned([("  " + path, why) for path, why in damaged])))
     return 0
 
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, known, task_of
+from lag_envs.commands.base import OWN, Command, known_id, task_of
 from lag_envs.own_files import is_file
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def run_list(args: argparse.Namespace) -> int:
     """Print a line for every environment."""
-    head, *rows = columns([("id", "control", "dt", "steps", "length"), *(_line(id) for id in TASKS)])
+    head, *rows = aligned([("id", "control", "dt", "steps", "length"), *(_line(id) for id in TASKS)])
     print(head)
     for id, row in zip(TASKS, rows, strict=True):
         print(f"{row}\n  {(inspect.getdoc(TASKS[id]) or '').partition(chr(10))[0]}")
@@ -59,10 +59,10 @@ def run_info(args: argparse.Namespace) -> int:
     if is_file(args.id):
         from lag_envs import own_files
 
-        task = own_files.made(own_files.one(args.id), args.id)
+        task = own_files.made_with_defaults(own_files.one(args.id), args.id)
         name = task.id or type(task).__name__
     else:
-        name = known(args.id)
+        name = known_id(args.id)
         task = task_of(name)
     print("\n".join(facts(task, name)))
     print("\n".join(_agents(task, name, args.id)))
@@ -72,9 +72,9 @@ def run_info(args: argparse.Namespace) -> int:
 def _agents(task: Task, name: str, given: str) -> list[str]:
     """Return a description of an environment's picture and agents."""
     from lag_envs.scores import known_returns
-    from lag_envs.watch import known
+    from lag_envs.watch import named_agents
 
-    lines = ["", "Agents by name, and how to see them", *_rows(known(task, name))]
+    lines = ["", "Agents by name, and how to see them", *_rows(named_agents(task, name))]
     lines += [f"  lag-envs watch {given} --agent NAME, or drive yourself: lag-envs play {given}"]
     if scale := known_returns(name):
         lines += [
@@ -85,7 +85,7 @@ def _agents(task: Task, name: str, given: str) -> list[str]:
 
 
 def _rows(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    return [f"  {line}" for line in columns(rows)]
+    return [f"  {line}" for line in aligned(rows)]
 
 
 LIST = Command(

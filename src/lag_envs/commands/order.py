@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from lag_envs.commands.base import OWN, Command, count, known, task_of
+from lag_envs.commands.base import OWN, Command, count, known_id, task_of
 from lag_envs.own_files import is_file
+from lag_envs.scenes.derivation import order_of
 
 
 def declare_order(parser: argparse.ArgumentParser) -> None:
@@ -20,17 +21,17 @@ def declare_order(parser: argparse.ArgumentParser) -> None:
 def run_order(args: argparse.Namespace) -> int:
     """Print the cost of each order of the series, and the best choice."""
     from lag_envs import own_files
-    from lag_envs.orders import ORDERS, lines, measure
+    from lag_envs.orders import ORDERS, lines, measure_orders
     from lag_envs.progress import progress
 
     if is_file(args.id):
         kind = own_files.one(args.id)
-        own_files.made(kind, args.id)
+        own_files.made_with_defaults(kind, args.id)
     else:
-        kind = type(task_of(known(args.id)))
+        kind = type(task_of(known_id(args.id)))
     with progress(args.rounds * len(ORDERS)) as advance:
-        times = measure(kind, args.num_envs, args.rounds, advance=lambda: advance(kind.__name__))
-    print("\n".join(lines(kind, times, kind().scene._order(kind().dt))))
+        times = measure_orders(kind, args.num_envs, args.rounds, advance=lambda: advance(kind.__name__))
+    print("\n".join(lines(kind, times, order_of(kind().scene, kind().dt))))
     return 0
 
 

@@ -37,7 +37,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
 def run_report(args: argparse.Namespace) -> int:
     """Measure errors and write the page."""
     needs("report", "flint", "jinja2", "matplotlib", "mpmath", "scipy", "sympy")
-    from lag_envs.report.report import SECTIONS, NotAReport, Settings, make_report
+    from lag_envs.report.report import SECTIONS, NotAReport, ReportSettings, make_report
 
     file, folder = _places(args.places)
     if file:
@@ -49,7 +49,7 @@ def run_report(args: argparse.Namespace) -> int:
                     f"--{option} is for the report about this package: leave out --{option} or {file}"
                 )
         own.subjects(file)  # errors in the file are reported before anything is measured
-        made = Settings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
+        made = ReportSettings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
         try:
             return 0 if make_report(made) else 130
         except (NotAReport, OSError) as error:
@@ -60,7 +60,7 @@ def run_report(args: argparse.Namespace) -> int:
             raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     if args.docs and (args.quick or names != SECTIONS):
         raise UserError("--docs needs a whole report: leave out --quick and --sections")
-    settings = Settings(folder, args.quick, names, args.processes, args.date)
+    settings = ReportSettings(folder, args.quick, names, args.processes, args.date)
     try:
         if not make_report(settings):
             return 130
@@ -80,9 +80,9 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
     if len(files) > 1 or len(folders) > 1:
         raise UserError(f"at most one FILE and one FOLDER, got {' '.join(places)}")
     if files:
-        from lag_envs.own_files import split
+        from lag_envs.own_files import split_path
 
-        return files[0], folders[0] if folders else f"report-{Path(split(files[0])[0]).stem}"
+        return files[0], folders[0] if folders else f"report-{Path(split_path(files[0])[0]).stem}"
     return "", folders[0] if folders else "report"
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.commands.base import OWN, Command, count, known, needs, seconds, task_of
+from lag_envs.commands.base import OWN, Command, count, known_id, needs, seconds, task_of
 from lag_envs.errors import UserError
 from lag_envs.own_files import is_file
 
@@ -75,7 +75,7 @@ def run_watch(args: argparse.Namespace) -> int:
             raise UserError(f"--board: there is no board in {args.board}")
         board = None
     try:
-        name, agent = watch.load(id, task, args.agent, board)
+        name, agent = watch.load_agent(id, task, args.agent, board)
         seed = secrets.randbelow(2**31) if args.seed is None else args.seed
         print(f"{id}: {name}", flush=True)
         limits = {"episodes": args.episodes, "steps": args.steps, "video": args.video}
@@ -114,8 +114,8 @@ def _shown(args: argparse.Namespace) -> tuple[str, Task]:
     if args.seed is not None and args.seed < 0:
         raise UserError(f"--seed must be at least 0, got {args.seed}")
     if not is_file(args.id):
-        return (id := known(args.id)), task_of(id)
-    task, path = own_files.one(args.id), own_files.split(args.id)[0]
+        return (id := known_id(args.id)), task_of(id)
+    task, path = own_files.one(args.id), own_files.split_path(args.id)[0]
     (id,) = own_files.registered(f"{path}:{task.__name__}")
     return id, make_task(id)
 

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
-from lag_envs.tasks.base import Lifted, Task, TaskFormulas
+from lag_envs.scenes.derivation import form_of, layout_of
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.formulas import Lifted, TaskFormulas
 
 Array = NDArray[np.float64]
 
@@ -275,10 +277,10 @@ class ObservationDecoder:
     """
 
     def __init__(self, task: Task) -> None:
-        formulas, form = task.formulas, task.scene._form
+        formulas, form = task.formulas, form_of(task.scene)
         k = SimpleNamespace(**formulas.constants())
         self.task, self._n = task, len(task.scene.state_names)
-        entries = enumerate(task.scene._layout.state)
+        entries = enumerate(layout_of(task.scene).state)
         angles = [i for i, entry in entries if entry.kind == "place" and entry.unit == "rad"]
         self._width = self._n + 2 * len(angles)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, actions_for
 from lag_envs.controllers.linear import Regulator
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks.base import Task
 
 
@@ -83,7 +84,7 @@ class PivotEnergyLQR(Pumped):
     ) -> None:
         super().__init__(task, **regulator)
         names = task.scene.state_names
-        self.coordinates = [list(task.scene._layout.free).index(name) for name in (pivot, angle)]
+        self.coordinates = [list(layout_of(task.scene).free).index(name) for name in (pivot, angle)]
         self.pivot, self.places = pivot, [names.index(n) for n in (pivot, f"{pivot}_dot", f"{angle}_dot")]
         self.pump, self.centring = pump, centring
         below = self.rest.copy()

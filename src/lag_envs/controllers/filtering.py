@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lag_envs.controllers.basic import Array, ObservationDecoder
 from lag_envs.controllers.tracking import follow, recorded
 from lag_envs.envs.model import Model
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
 
 
@@ -94,7 +95,7 @@ class Filtered:
 
     def _move(self, known: Belief) -> tuple[Array, Array]:
         """Return estimate and covariance one step later."""
-        form, x = self.task.scene._form, known.state
+        form, x = form_of(self.task.scene), known.state
         lifted = list(form.lift(x) if form else x.T)
         applied = self.task.formulas.control(np, [known.action], lifted, [], self._k)
         controls = np.stack(np.broadcast_arrays(*applied), axis=-1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
 from lag_envs.envs.model import REACH, Model
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
 
 #: Step sizes of the line search, tried in parallel.
@@ -138,14 +139,14 @@ class ILQR:
         assert best is not None
         return best, most
 
-    def _step(self, x: Array, actions: Array, targets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def advance(self, x: Array, actions: Array, targets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Step the model for arrays of any leading shape."""
         shape = actions.shape
-        goals = self._goals(targets, shape)
+        goals = self.goals_for(targets, shape)
         z, reward, ended = self.model(x.reshape(-1, x.shape[-1]), actions.ravel(), goals)
         return z.reshape(x.shape), reward.reshape(shape), ended.reshape(shape)
 
-    def _goals(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
+    def goals_for(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
         """Return the targets of as many steps, or None if the task has none."""
         return None if self.task.target_range is None else np.broadcast_to(targets, shape).ravel()
 
@@ -153,13 +154,13 @@ class ILQR:
         """Return a controller's actions (n, steps)."""
         x, memory, actions = starts, None, np.empty((len(starts), self.steps))
         for t in range(self.steps):
-            form, formulas = self.task.scene._form, self.task.formulas
+            form, formulas = form_of(self.task.scene), self.task.formulas
             lifted = form.lift(x) if form else tuple(x.T)
             seen = formulas.observe(np, lifted, [targets] * formulas.targets, self._k)
             observation = np.stack(np.broadcast_arrays(*seen), axis=-1)
             action, memory = guess.predict(observation, memory)
             actions[:, t] = action[:, 0]
-            x = self._step(x, actions[:, t], targets)[0]
+            x = self.advance(x, actions[:, t], targets)[0]
         return actions
 
     def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
@@ -211,7 +212,7 @@ class ILQR:
                 actions[:, t, None] + shares * change[:, t, None] + feedback, -self.largest, self.largest
             )
             xs[:, :, t], us[:, :, t] = x, u
-            x, reward, ended = self._step(x, u, goals)
+            x, reward, ended = self.advance(x, u, goals)
             total += np.where(alive, reward, 0.0)
             alive &= ~ended
         if self.tail is not None:
@@ -235,7 +236,7 @@ class ILQR:
         for first in range(0, n, size):
             part = slice(first, first + size)
             x, u = states[part].reshape(-1, width), inner[part].ravel()
-            found = self.model.expand(x, u, self._goals(targets[part, None], actions[part].shape))
+            found = self.model.expand(x, u, self.goals_for(targets[part, None], actions[part].shape))
             slopes[part] = found.slopes.transpose(0, 2, 1).reshape(slopes[part].shape)
             gradient[part] = found.gradient.reshape(gradient[part].shape)
             curvature[part] = found.curvature.reshape(curvature[part].shape)
@@ -249,7 +250,7 @@ class ILQR:
     def _expand_tail(self, states: Array, actions: Array, targets: Array) -> tuple[Array, Array]:
         """Return gradient and curvature of minus the final cost at the plan's end."""
         assert self.tail is not None
-        ends = self._step(states[:, -1], actions[:, -1], targets)[0]
+        ends = self.advance(states[:, -1], actions[:, -1], targets)[0]
         n, width = ends.shape
         moves = REACH * np.eye(width)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import sympy
@@ -14,13 +15,16 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from lag_envs.controllers.basic import FeedbackController, FeedbackLaw, hold_law
+from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
 
-def cost(task: Task, state: Sequence[float] | Array, control: float = 0.0, target: float = 0.0) -> Array:
+def quadratic_cost(
+    task: Task, state: Sequence[float] | Array, control: float = 0.0, target: float = 0.0
+) -> Array:
     """Return the matrix C of a step's loss (x, u)' C (x, u), the reward's to second order.
 
     Parameters
@@ -35,8 +39,9 @@ def cost(task: Task, state: Sequence[float] | Array, control: float = 0.0, targe
     scene = task.scene
     x = [sympy.Symbol(name, real=True) for name in (*scene.state_names, "u")]
     lifted: list = list(x[:-1])
-    if scene._form is not None and scene._form.angle is not None:
-        angle = x[scene._form.angle]
+    form: Any = form_of(scene)
+    if form is not None and form.angle is not None:
+        angle = x[form.angle]
         lifted += [sympy.cos(angle), sympy.sin(angle)]
     k = SimpleNamespace(**task.formulas.constants())
     reward = task.formulas.reward(Symbolic, lifted, lifted, x[-1:], [target] * task.formulas.targets, k)
@@ -63,7 +68,7 @@ def regulator(
         Additional costs of a step of the task's own interval: weights of the squares of states, by name, and
         of "u".
     """
-    c = cost(task, state, control, target)
+    c = quadratic_cost(task, state, control, target)
     names = [*task.scene.state_names, "u"]
     for name, weight in (extra or {}).items():
         c[names.index(name), names.index(name)] += weight * task.dt / task.interval
@@ -186,7 +191,7 @@ class Regulator(FeedbackController):
 
 
 class BalanceLQR(FeedbackController):
-    """Keep bodies on a moving support upright by a linear-quadratic regulator, in spite of kicks.
+    """Keep bodies on a moving support upright by a linear-quadratic regulator, despite kicks.
 
     The reward alone would make the control as hard as possible; the added weights keep the regulator ready
     for the next kick. ``python -m agents.tune`` found them.
@@ -204,7 +209,7 @@ class BalanceLQR(FeedbackController):
     def __init__(self, task: Task, *, effort: float = 0.03, slide: float = 0.67, turn: float = 1.04) -> None:
         super().__init__(task)
         self.rest = np.array(task.examples.rest)
-        rates = {f"{name}_dot": turn for name in task.scene._layout.free}
+        rates = {f"{name}_dot": turn for name in layout_of(task.scene).free}
         extra = {"u": effort / task.limit_control**2, "s_dot": slide, **rates}
         self.gain, self.cost = regulator(task, self.rest, extra=extra)
 

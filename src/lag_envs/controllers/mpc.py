@@ -169,14 +169,14 @@ class MPC:
             action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
             after = 0.0 if self.hold is None else self.hold.act(x, targets, np.full(len(x), np.inf))
             actions[:, t] = np.where(step < self.horizon, action, after).clip(-self.largest, self.largest)
-            x, _, _ = self.model(x, actions[:, t], self.planner._goals(targets, (len(x),)))
+            x, _, _ = self.model(x, actions[:, t], self.planner.goals_for(targets, (len(x),)))
         return actions
 
     def _ends_badly(self, states: Array, actions: Array, targets: Array) -> NDArray[np.bool_]:
         """Return which plans end badly."""
         if self.tail is None:
             return np.zeros(len(states), np.bool_)
-        return self.tail(self.planner._step(states[:, -1], actions[:, -1], targets)[0]) > self.good
+        return self.tail(self.planner.advance(states[:, -1], actions[:, -1], targets)[0]) > self.good
 
     def _search(self, x: Array, targets: Array) -> tuple[Any, Array]:
         """Return the best of plans from random guesses, and its value."""

@@ -133,14 +133,14 @@ class Tracking(Clocked):
         )
 
 
-def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
+def plan_file(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
     """Return the place of a task's plan: the one to follow, or the "quick" one as an initial guess."""
     return (folder or FOLDER) / f"{task.plans.of or task.id}-{kind}.npz"
 
 
 def recorded(task: Task, kind: str = "followed") -> Tracking:
     """Return the controller that follows the recorded plan of a task's id."""
-    return Tracking.load(task, file_of(task, kind))
+    return Tracking.load(task, plan_file(task, kind))
 
 
 def hold(task: Task) -> Tracking:

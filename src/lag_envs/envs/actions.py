@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.checks import is_masked, shown
-from lag_envs.tasks.base import TaskFormulas
+from lag_envs.tasks.formulas import TaskFormulas
 
 #: Types of actions that compiled steps take without conversion.
 AS_THEY_ARE = np.dtype(np.float32), np.dtype(np.float64)

@@ -13,6 +13,7 @@ import numpy as np
 
 from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.mechanics.recording import Values
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.picture import Picture, places
 from lag_envs.scenes.shapes import Arrow, Frame, Point, Pose, arc
 from lag_envs.tasks.base import Task
@@ -41,7 +42,7 @@ class Forces:
         self._long = LONG * min(view.right - view.left, view.top - view.bottom)
         own = any(isinstance(shape, Arrow) for _, shape in picture.shapes)
         self._controls = () if own else tuple(acting.control for acting in task.formulas.acting)
-        self._reactions = dict(self._scene._layout.reactions)
+        self._reactions = dict(layout_of(self._scene).reactions)
         self._usual = self._sizes()
 
     def arrows(self, now: Frame, poses: Sequence[Pose]) -> Iterator[tuple[Arrow, bool]]:
@@ -80,7 +81,7 @@ class Forces:
 
     def _effect(self, name: str, now: Frame, q: Mapping[str, float]) -> dict[str, float]:
         """Return the coordinates on which a control acts at full size, each with its share of the force."""
-        layout = self._scene._layout
+        layout = layout_of(self._scene)
         for moved in layout.prescribed:
             if moved.control == name:
                 return {moved.name: 1.0}
@@ -95,7 +96,7 @@ class Forces:
         scene = self._scene
 
         def control(size: float) -> Values:
-            layout = scene._layout
+            layout = layout_of(scene)
             given = dict.fromkeys((*layout.controls, *layout.absent), 0.0)
             return Values("control", given | {name: size})
 

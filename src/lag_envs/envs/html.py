@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.envs import raster
-from lag_envs.scenes.html import parameters, table
+from lag_envs.scenes.html import html_table, parameter_rows
 from lag_envs.tasks.base import Task
 
 
-def described(task: Task, title: str, spaces: dict[str, Any], picture: NDArray[np.uint8] | None) -> str:
+def environment_html(
+    task: Task, title: str, spaces: dict[str, Any], picture: NDArray[np.uint8] | None
+) -> str:
     """Return an environment's HTML for a notebook.
 
     Parameters
@@ -50,9 +52,9 @@ def described(task: Task, title: str, spaces: dict[str, Any], picture: NDArray[n
         ("episode", f"{task.limit:g} steps, {task.duration:g} s"),
     ]
     return (
-        f"<div><b>{escape(title)}</b> {escape(about)}<br>{image}{table(rows)}"
+        f"<div><b>{escape(title)}</b> {escape(about)}<br>{image}{html_table(rows)}"
         f"<details><summary>{escape(type(task.scene).__name__)}</summary>"
-        f"{table(parameters(task.scene), ('parameter', 'value'))}</details></div>"
+        f"{html_table(parameter_rows(task.scene), ('parameter', 'value'))}</details></div>"
     )
 
 

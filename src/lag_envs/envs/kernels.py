@@ -161,7 +161,7 @@ KERNEL step(long long n, real *rows, word *ids, int *ages, const real *k, long l
 """
 
 
-class Kernels(NamedTuple):
+class TaskKernels(NamedTuple):
     """A task's kernels.
 
     Attributes
@@ -183,7 +183,7 @@ class Kernels(NamedTuple):
     constants: tuple[float, ...]
 
 
-def kernels_of(task: Task, single: bool = False) -> Kernels:
+def kernels_of(task: Task, single: bool = False) -> TaskKernels:
     """Print the step of a batch.
 
     Parameters
@@ -225,4 +225,4 @@ def kernels_of(task: Task, single: bool = False) -> Kernels:
         _KERNELS.replace("CHOICES", choices),
         "}\n",
     ]
-    return Kernels("".join(parts), rows.u.stop, rows.g, rows.u, tuple(program.constants))
+    return TaskKernels("".join(parts), rows.u.stop, rows.g, rows.u, tuple(program.constants))

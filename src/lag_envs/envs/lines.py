@@ -10,7 +10,7 @@ from lag_envs.stepping.flows import section
 from lag_envs.stepping.tracing import Trace
 
 
-def recorded(
+def recorded_lines(
     formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], trace: type[Trace]
 ) -> list[str]:
     """Record a formula; outputs that turned out constant are assigned as well."""
@@ -18,7 +18,7 @@ def recorded(
     return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if value != name]
 
 
-def draw(names: Sequence[str], step: str) -> list[str]:
+def draw_lines(names: Sequence[str], step: str) -> list[str]:
     """Draw uniform numbers of a step."""
     return [f"{name} = uniform(key, {step}, np.uint64({i}))" for i, name in enumerate(names)]
 
@@ -32,7 +32,7 @@ def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
     ]
 
 
-def block(head: str, body: Sequence[str]) -> list[str]:
+def indented(head: str, body: Sequence[str]) -> list[str]:
     """Put lines under a header."""
     return [head, *indent(body)]
 
@@ -42,7 +42,7 @@ def indent(lines: Sequence[str], levels: int = 1) -> list[str]:
     return ["    " * levels + line for line in lines]
 
 
-def function(
+def compiled_lines(
     name: str, arguments: str, body: Sequence[str], *helpers: Callable, inner: bool = False
 ) -> Callable:
     """Compile a function of these lines; see `compile_function`."""

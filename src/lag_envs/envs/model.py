@@ -13,6 +13,7 @@ from lag_envs.envs.program import constants_of, program_for
 from lag_envs.envs.reverse import Reverse
 from lag_envs.envs.single import absent
 from lag_envs.scenes.checks import check_parameters, real_array
+from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -250,7 +251,7 @@ class Model:
         ValueError, StepRefused
             As a step does; ValueError also for a task whose actions are choices.
         """
-        formulas, form, k = self.task.formulas, self.task.scene._form, self._constants
+        formulas, form, k = self.task.formulas, form_of(self.task.scene), self._constants
         if formulas.choices:
             raise ValueError(
                 f"{type(self.task).__name__} has a list of actions to choose from, which have no derivatives"
@@ -299,7 +300,7 @@ class Model:
         draws : array_like, shape (task.draws, n)
             The random numbers in [0, 1) of the kick.
         """
-        array, form = real_array("states", states), self.task.scene._form
+        array, form = real_array("states", states), form_of(self.task.scene)
         rows = form.lift(array) if form else tuple(array.T)
         kicked = self.task.formulas.kick(np, list(real_array("draws", draws)), rows, self._constants)
         return np.stack(np.broadcast_arrays(*kicked[: self._n_state]), axis=-1)

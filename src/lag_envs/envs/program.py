@@ -24,9 +24,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs import sharing
-from lag_envs.envs.lines import block, draw, function, indent, next_episode, recorded
+from lag_envs.envs.lines import compiled_lines, draw_lines, indent, indented, next_episode, recorded_lines
 from lag_envs.stepping.compiling import BLOCK
-from lag_envs.stepping.flows import split
+from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.rows import Rows
 
 DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
@@ -110,28 +110,28 @@ class Program:
             return SimpleNamespace(**dict(zip(constants, values, strict=True)))
 
         def control(xp: Any, *values: Any) -> Sequence:
-            a, y, g, rest = split(values, actions, width, targets)
+            a, y, g, rest = split_lengths(values, actions, width, targets)
             return formulas.control(xp, a, y, g, k(rest))
 
         def outcome(xp: Any, *values: Any) -> list:
-            u, g, y, z, rest = split(values, controls, targets, width, width)
+            u, g, y, z, rest = split_lengths(values, controls, targets, width, width)
             reward, ended = formulas.outcome(xp, y, z, u, g, k(rest))
             return [reward, xp.where(ended, 1.0, 0.0)]
 
         def last(xp: Any, *values: Any) -> list:
-            u, g, y, z, rest = split(values, controls, targets, width, width)
+            u, g, y, z, rest = split_lengths(values, controls, targets, width, width)
             return [formulas.last(xp, y, z, u, g, k(rest))]
 
         def kick(xp: Any, *values: Any) -> Sequence:
-            draws, z, rest = split(values, formulas.draws, width)
+            draws, z, rest = split_lengths(values, formulas.draws, width)
             return formulas.kick(xp, draws, z, k(rest))
 
         def observe(xp: Any, *values: Any) -> Sequence:
-            g, y, rest = split(values, targets, width)
+            g, y, rest = split_lengths(values, targets, width)
             return formulas.observe(xp, y, g, k(rest))
 
         def start(xp: Any, *values: Any) -> list:
-            draws, rest = split(values, states + targets)
+            draws, rest = split_lengths(values, states + targets)
             numbers = vars(k(rest))
             state = [
                 numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)
@@ -139,7 +139,7 @@ class Program:
             return state + formulas.sample_targets(draws[states:], numbers)
 
         def lines(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
-            return recorded(formula, inputs, outputs, formulas.trace)
+            return recorded_lines(formula, inputs, outputs, formulas.trace)
 
         top = formulas.largest
         self.clip = [
@@ -158,13 +158,15 @@ class Program:
         self.last = lines(last, step, ["r"]) if formulas.has_last else []
         draws, kicked = [f"draw{i}" for i in range(formulas.draws)], [f"e{i}" for i in range(width)]
         self.kick = (
-            draw(draws, "np.uint64(n)") + lines(kick, [*draws, *self.z, *given], kicked) if draws else []
+            draw_lines(draws, "np.uint64(n)") + lines(kick, [*draws, *self.z, *given], kicked)
+            if draws
+            else []
         )
         self.moved = kicked if draws else self.z
         self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
         self.observe = lines(observe, [*self.g, *self.y, *given], self.o)
         draws, names = ([f"{name}{i}" for i in range(states + targets)] for name in ("draw", "s"))
-        self.sample = draw(draws, "np.uint64(0)") + lines(start, [*draws, *given], names)
+        self.sample = draw_lines(draws, "np.uint64(0)") + lines(start, [*draws, *given], names)
         self.lift = formulas.lift("y")
 
     @property
@@ -190,7 +192,7 @@ class Program:
             *self._finish_one(),
         ]  # fmt: skip
         helpers = [self._stepper.engine()] if self.general else []
-        return function("step_one", "f, obs, a, ids", body, *helpers)
+        return compiled_lines("step_one", "f, obs, a, ids", body, *helpers)
 
     @property
     def _advance_one(self) -> list[str]:
@@ -210,7 +212,9 @@ class Program:
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step after `advance` has filled in the rows ``z``."""
         rows = self._one.load([*self.y, *self.z, *self.g, *self.u, "n"])
-        return function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
+        return compiled_lines(
+            "finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()]
+        )
 
     @cached_property
     def start_one(self) -> Callable:
@@ -222,7 +226,7 @@ class Program:
             *self._one.store([*self.y, *self.g, *self.u, "n", *self.drawn]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
-        return function("start_one", "f, obs, ids, state_given, target_given", body)
+        return compiled_lines("start_one", "f, obs, ids, state_given, target_given", body)
 
     @cached_property
     def advance(self) -> Callable:
@@ -260,7 +264,7 @@ class Program:
             "return 0",
         ]  # fmt: skip
         arguments = "states, actions, targets, par, ends, rewards, ended"
-        return function("model", arguments, body, self._stepper.engine())
+        return compiled_lines("model", arguments, body, self._stepper.engine())
 
     @property
     def room(self) -> int:
@@ -331,7 +335,7 @@ class Program:
             after = self._load([rows[name] for name in self._stepper.results], self._stepper.results)
             start, dt = f"np.int64({len(self.uniform)})", "k_dt"
             call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
-            moving = [*block(lane, before), call]
+            moving = [*indented(lane, before), call]
             move = [*self._load(self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
             again = [*self._load(self.u), *self.fast, *after, *self._stepper.finish]
             helpers = [self._stepper.compile_block()]
@@ -393,19 +397,21 @@ class Program:
                 *(
                     line
                     for j, a in enumerate(self.a)
-                    for line in block(lane, [f"{self._at(a)} = action[{self._action(j)}]"])
+                    for line in indented(lane, [f"{self._at(a)} = action[{self._action(j)}]"])
                 ),
                 *moving,
-                *block(lane, main),
-                *block(lane, [f"slow += {ordinary} == 0.0", f"restarts += {ordinary} == 2.0"]),
-                "if slow > 0:", *indent(block(lane, redo)),
-                "if restarts > 0:", *indent(block(lane, restart)),
-                *block(lane, output),
+                *indented(lane, main),
+                *indented(lane, [f"slow += {ordinary} == 0.0", f"restarts += {ordinary} == 2.0"]),
+                "if slow > 0:", *indent(indented(lane, redo)),
+                "if restarts > 0:", *indent(indented(lane, restart)),
+                *indented(lane, output),
                 # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
-                *(line for entry in self._shown for line in block(lane, [entry])),
+                *(line for entry in self._shown for line in indented(lane, [entry])),
             ]),
         ]  # fmt: skip
-        return function("step_blocks", sharing.STEP_BLOCKS, body, *helpers, *sharing.claiming(), inner=True)
+        return compiled_lines(
+            "step_blocks", sharing.STEP_BLOCKS, body, *helpers, *sharing.claiming(), inner=True
+        )
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""
@@ -451,9 +457,11 @@ class Program:
             *self._parameters(),
             "second, last = np.uint64(count), np.uint64(2 * count)",
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
-            *indent([*self._place, self._base, *block("for i in range(size):", start)]),
+            *indent([*self._place, self._base, *indented("for i in range(size):", start)]),
         ]  # fmt: skip
-        return function("start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body)
+        return compiled_lines(
+            "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
+        )
 
     # The rows of the current environment: those kept from step to step, and those needed within one, which
     # exist once for all blocks.

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from lag_envs.envs import raster
 from lag_envs.envs.forces import Forces
 from lag_envs.scenes import shapes as s
-from lag_envs.scenes.picture import Picture, turning
+from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import Frame, Point, Pose, Reading, Role, Shape, Window
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 
 if TYPE_CHECKING:
     import pygame
@@ -238,17 +238,17 @@ class Viewer:
             write_readout(image, self._readings(now, seconds, total), self._pen.scale)
         return image
 
-    def _more(self, now: Frame, poses: list[Pose]) -> Iterator[Extra]:
+    def _more(self, now: Frame, poses: list[Pose]) -> Iterator[StyledShape]:
         """Yield trail and arrows."""
         pieces = min(12, len(self._trail) - 1)
         for tip in range(len(self._tips)):
             way = [points[tip] for points in self._trail]
             for i in range(pieces):
                 part = way[i * (len(way) - 1) // pieces : (i + 1) * (len(way) - 1) // pieces + 1]
-                yield Extra(s.Line(part), TRAIL, (i + 1.0) / pieces)
+                yield StyledShape(s.Line(part), TRAIL, (i + 1.0) / pieces)
         if self._forces is not None:
             for arrow, is_control in self._forces.arrows(now, poses):
-                yield Extra(arrow, STYLES["action"] if is_control else FORCE, 1.0)
+                yield StyledShape(arrow, STYLES["action"] if is_control else FORCE, 1.0)
 
     def _readings(self, now: Frame, seconds: float, total: float) -> list[list[Reading]]:
         """Return the rows of the read-out."""
@@ -265,7 +265,7 @@ class Viewer:
 
     def _turn(self, state: list[float]) -> None:
         """Integrate angles that the state leaves out; exact if rates are linear and every step is drawn."""
-        rate = np.array(turning(self._task.scene, state))
+        rate = np.array(left_out_rates(self._task.scene, state))
         if self._before is not None and self._before[0] != state:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
         self._before = (state, rate)
@@ -273,7 +273,7 @@ class Viewer:
     # --- real time ------------------------------------------------------------------------------------------
 
     def _is_due(self) -> bool:
-        """Tell whether to show this step: if steps are faster than the window, only some are shown."""
+        """Return whether to show this step: if steps are faster than the window, only some are shown."""
         now = time.perf_counter()
         self._due += self._task.dt
         if not now - 0.25 < self._due:
@@ -288,7 +288,7 @@ class Viewer:
 
 def _scale(task: Task) -> tuple[float, float] | None:
     """Return the returns with scores 0 and 1; None if the task's parameters are not the standard ones."""
-    known, usual = measured(task.id).get("scale"), type(task)()
+    known, usual = measured_entry(task.id).get("scale"), type(task)()
     same = (task.scene, task.dt, task.duration) == (usual.scene, usual.dt, usual.duration)
     return (known["random"], known["best"]) if known and same else None
 
@@ -351,7 +351,7 @@ def tiled(pictures: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uin
 # --- painting ---------------------------------------------------------------------------------------------
 
 
-class Extra(NamedTuple):
+class StyledShape(NamedTuple):
     """A line or an arrow in the plane with a style of its own, and how opaque it is."""
 
     shape: s.Line | s.Arrow
@@ -393,14 +393,14 @@ class Pen:
         self._middle = 0.5 * width, 0.5 * (height - strip)
         self._shapes = [x for x in picture.shapes if not isinstance(x[1], s.Magnifier)]
         self._lenses = [x for x in picture.shapes if isinstance(x[1], s.Magnifier)] if glass is None else []
-        #: Rulers' outlines depend on the view and are made anew for each picture.
+        #: Rulers' outlines depend on the view and are rebuilt for each picture.
         self._outlines = [self._outline(shape) for _, shape in self._shapes]
         self._room = np.zeros((height, width + 2))
         self._plane = len(picture.frames)
         self._glass: Glass | None = None
 
     def paint(
-        self, image: NDArray[np.uint8], poses: Sequence[Pose], view: Window, more: Sequence[Extra] = ()
+        self, image: NDArray[np.uint8], poses: Sequence[Pose], view: Window, more: Sequence[StyledShape] = ()
     ) -> None:
         """Paint the shapes, and then the extras in the plane, over an image."""
         places = self._places(poses, view)

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.envs.program import constants_of
+from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import pulled
-from lag_envs.stepping.adjoint import Differentiable, Lanes
-from lag_envs.stepping.flows import split
+from lag_envs.stepping.adjoint import Differentiable, LaneFormula
+from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
 
@@ -62,8 +63,8 @@ class Reverse:
         sizes |= {"own_y": sizes["y"], "own_u": sizes["u"], "own_g": sizes["g"], "own_p": len(parameters)}
         sizes |= {"moved": sizes["y"] + sizes["u"] + len(parameters)}
         self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
-        self._form = task.scene._form
-        self._compiled: dict[str, Lanes] = {}
+        self._form = form_of(task.scene)
+        self._compiled: dict[str, LaneFormula] = {}
 
     def observations(self, states: Array, targets: Array) -> Array:
         """Return the observations of states (n, n_state) with targets (n, n_targets)."""
@@ -124,7 +125,7 @@ class Reverse:
 
     # --- formulas ------------------------------------------------------------------------------------------
 
-    def _lanes(self, name: str, formula: Callable, *arrays: str) -> Lanes:
+    def _lanes(self, name: str, formula: Callable, *arrays: str) -> LaneFormula:
         """Return a formula, compiled on first use; `arrays` are its arguments."""
 
         def of_numbers(xp: Differentiable, numbers: dict[str, Any]) -> list[list]:
@@ -134,15 +135,15 @@ class Reverse:
 
         if name not in self._compiled:
             names = [self._names[array] for array in arrays]
-            self._compiled[name] = Lanes(name, of_numbers, names, self._constants, self._absent)
+            self._compiled[name] = LaneFormula(name, of_numbers, names, self._constants, self._absent)
         return self._compiled[name]
 
-    def _whole(self, kicked: bool) -> Lanes:
+    def _whole(self, kicked: bool) -> LaneFormula:
         name = "whole_kicked" if kicked else "whole"
         formula = partial(self._whole_of, kicked)
         return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
 
-    def _after(self, kicked: bool) -> Lanes:
+    def _after(self, kicked: bool) -> LaneFormula:
         name = "after_kicked" if kicked else "after"
         formula = partial(self._after_of, kicked)
         return self._lanes(name, formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")
@@ -177,22 +178,22 @@ class Reverse:
         by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
         bars = [x for name in ("by_r", "by_o", "by_e") for x in seeds[name]]
         found = xp.adjoint(outputs, bars, [x for numbers in by for x in numbers])
-        own_y, own_z, *rest, own_e = split(found, *map(len, by[:-1]))
+        own_y, own_z, *rest, own_e = split_lengths(found, *map(len, by[:-1]))
         return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
 
     def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, **found: list) -> list[list]:
         """Record the way back from the controls, and all sums: cotangents of y, a, g and parameters."""
-        by_y, by_u, by_p = split(found["moved"], len(y), len(found["own_u"]))
+        by_y, by_u, by_p = split_lengths(found["moved"], len(y), len(found["own_u"]))
         by = [y, a, g, self._parameters_of(k)]
         bars = _sums(found["own_u"], by_u)
         own = xp.adjoint(self._control_of(xp, k, y, a, g)[0], bars, [x for numbers in by for x in numbers])
-        last_y, last_a, last_g, last_p = split(own, *map(len, by[:-1]))
+        last_y, last_a, last_g, last_p = split_lengths(own, *map(len, by[:-1]))
         by_y, by_p = _sums(found["own_y"], by_y, last_y), _sums(found["own_p"], by_p, last_p)
         return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
 
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
         """Record the way back through the whole step: cotangents of y, a, g, no parameters; 1 if ordinary."""
-        stepper: Any = self._task.scene._code(self._task.dt)
+        stepper: Any = code_of(self._task.scene, self._task.dt)
         (u,) = self._control_of(xp, k, y, a, g)
         own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
         moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])

@@ -48,7 +48,7 @@ def words(blocks: int) -> int:
     return WORDS + 2 * blocks
 
 
-def describe(ids: NDArray[np.uint64], count: int, kept: Sequence[str]) -> None:
+def write_places(ids: NDArray[np.uint64], count: int, kept: Sequence[str]) -> None:
     """Write into a batch's keys where its rows lie."""
     ids[3 * count + 10 : 3 * count + 12] = len(kept) * BLOCK, kept.index("n") * BLOCK
 
@@ -113,7 +113,7 @@ def _step_all(  # type: ignore[no-untyped-def]
 
 
 def _bad_action(f, action, count, size, first):  # type: ignore[no-untyped-def]
-    """Return -(i + 1) if action i is not finite, or 0; of a row in `f`, see `describe`.
+    """Return -(i + 1) if action i is not finite, or 0; of a row in `f`, see `write_places`.
 
     An environment that is to be restarted ignores its action.
     """
@@ -134,7 +134,7 @@ def _next_block(ids, at, turn, blocks, tried, share, shares):  # type: ignore[no
     """Claim a block; return it, or `blocks` if none is left, and how many have been tried.
 
     Shares lie next to one another. The two threads of each pair of shares start at its opposite ends and meet
-    in the middle; then they go on to the next pair.
+    in the middle; then they continue with the next pair.
     """
     first = share * blocks // shares
     last = (share + np.uint64(1)) * blocks // shares - np.uint64(1)
@@ -158,7 +158,7 @@ def _hand_in(ids, at, taken, over, refused):  # type: ignore[no-untyped-def]
 
 
 def _opened(ids, at, turn):  # type: ignore[no-untyped-def]
-    """Tell whether a turn is open, or over; wait for it a little while."""
+    """Return whether a turn is open, or over, after waiting briefly."""
     for _ in range(PATIENCE):
         if atomic_load(ids, at) >= turn:
             return True
@@ -166,7 +166,7 @@ def _opened(ids, at, turn):  # type: ignore[no-untyped-def]
 
 
 def _done(ids, at):  # type: ignore[no-untyped-def]
-    """Tell whether all blocks of the last turn are done; wait for them a little while."""
+    """Return whether all blocks of the last turn are done, after waiting briefly."""
     for _ in range(PATIENCE):
         if atomic_load(ids, at + np.uint64(1)) == np.uint64(0):
             return True

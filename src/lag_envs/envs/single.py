@@ -148,7 +148,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         given_target = None if target is None else np.atleast_1d(self.task.check_target(target))
         super().reset(seed=seed)
         if seed is not None:
-            self._ids[:2] = key_of(seed), 0
+            self._ids[:2] = seed_key(seed), 0
         elif not self._started:
             self._ids[:2] = self.np_random.integers(2**63), 0
         self._started = True
@@ -275,7 +275,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         TypeError, ValueError
             For something that is not a snapshot, or one of another environment; then nothing is changed.
         """
-        snapshots.check(snapshot, self._about, self._program.kept)
+        snapshots.check_snapshot(snapshot, self._about, self._program.kept)
         for name, values in snapshot.rows.items():
             self._rows[self._row[name]] = values[0]
         self._ids[:] = snapshot.ids[:, 0]
@@ -285,7 +285,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def _about(self) -> dict[str, Any]:
         """The properties that a snapshot must share."""
-        return snapshots.about([self.task], num_envs=None)
+        return snapshots.properties([self.task], num_envs=None)
 
     # --- for inspection ------------------------------------------------------------------------------------
 
@@ -339,12 +339,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: the current picture, spaces, controls, parameters."""
-        from lag_envs.envs.html import described, still
+        from lag_envs.envs.html import environment_html, still
 
         now = (self.state, self.control, self.target) if self._started else ()
         title = self.spec.id if self.spec else type(self.task).__name__
         spaces = {"observation": self.observation_space, "action": self.action_space}
-        return described(self.task, title, spaces, still(self.task, *now))
+        return environment_html(self.task, title, spaces, still(self.task, *now))
 
     # --- internal ------------------------------------------------------------------------------------------
 
@@ -383,7 +383,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, and compile anew (from the cache)."""
+        """Restore, and compile again (from the cache)."""
         self.__dict__.update(state)
         self._program = program_of(self.task, [numbers_of(self.task)])
         self._bind()
@@ -404,18 +404,18 @@ def true_spec(spec: EnvSpec, limit: float) -> EnvSpec:
     """
     steps = int(limit) if math.isfinite(limit) else None
     # `make_vec` passes the number of steps on as a keyword, which the spec need not repeat.
-    kwargs = {name: plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
+    kwargs = {name: plain_data(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
     return dataclasses.replace(spec, max_episode_steps=steps, kwargs=kwargs)
 
 
-def plain(value: Any) -> Any:
+def plain_data(value: Any) -> Any:
     """Return arrays and NumPy numbers as lists and numbers, an enum as its value, others unchanged."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
+        return [plain_data(v) for v in value]
     if isinstance(value, Mapping):
-        return {name: plain(v) for name, v in value.items()}
+        return {name: plain_data(v) for name, v in value.items()}
     return value.value if isinstance(value, enum.Enum) else value
 
 
@@ -463,7 +463,7 @@ def check_seed(name: str, seed: Any) -> int:
     return int(seed)
 
 
-def key_of(seed: int) -> int:
+def seed_key(seed: int) -> int:
     """Return the 64-bit key for a seed: the seed itself, or a digest if it has more bits."""
     return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
 

@@ -44,7 +44,7 @@ class Snapshot:
     ready: bool = True
 
 
-def about(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
+def properties(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
     """Return the properties that a snapshot must share, by name, in the order in which errors name them."""
     first, kind = tasks[0], type(tasks[0])
     found: dict[str, Any] = {"task": f"{kind.__module__}:{kind.__qualname__}", **options}
@@ -59,7 +59,7 @@ def about(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
     return found | asked | {"randomize": _common(drawn)}
 
 
-def check(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) -> None:
+def check_snapshot(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) -> None:
     """Raise an error for something that is not a snapshot, or a snapshot of another environment."""
     if not isinstance(snapshot, Snapshot):
         raise TypeError(f"set_state takes what get_state returned, got {shown(snapshot)}")

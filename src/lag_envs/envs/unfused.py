@@ -13,7 +13,7 @@ environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 ``start(f, d, k)`` sets an episode's start, from one draw for each entry of state and target
 ``lift(f, k)``     computes what the formulas need besides the state: call it after setting the state by hand
 ``move(f, a, k)``  takes a step: control, motion, reward, ending
-``kick(f, d, k)``  applies the random disturbance after the step
+``kick(f, d, k)``  applies the random kick after the step
 ``observe(f, k)``  computes the observation
 ``poses(f, p, k)`` computes the poses of the picture's frames: x, y, angle and part of each
 =================  ==========================================================================================
@@ -43,18 +43,19 @@ import numpy as np
 from lag_envs.envs.actions import Actions
 from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.program import DRAWS
-from lag_envs.envs.single import key_of
+from lag_envs.envs.single import seed_key
 from lag_envs.mechanics.algebra import FormulaError, evaluate
-from lag_envs.mechanics.recording import parameter
+from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import ORDER
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.scenes.shapes import Frame
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.flows import split
-from lag_envs.stepping.general import usual_order
-from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
+from lag_envs.stepping.flows import split_lengths
+from lag_envs.stepping.general import stepper_of, usual_order
+from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, run_python, script_motion
 from lag_envs.stepping.series import TOLERANCE
-from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 
@@ -63,7 +64,7 @@ from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 SINGLE_TOLERANCE = 2.0**-25
 
 
-class Rows(NamedTuple):
+class ScriptRows(NamedTuple):
     """The places of an environment's numbers in ``f``.
 
     Attributes
@@ -124,22 +125,22 @@ class UnfusedProgram:
                 "scripts lack; switch them off with None, as in observation_noise=None"
             )
         self.task, formulas, scene = task, task.formulas, task.scene
-        self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
+        self._formulas, self._form, self._stepper = formulas, form_of(scene), stepper_of(scene.mechanics)
         own = formulas.constants()
-        scenes = scene._constants()
+        scenes = motion_constants_of(scene)
         self.given = {name: value for name, value in own.items() if name not in scenes and name != "x"}
         self.given["strength"] = 1.0
         fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
         #: Parameters that are computed from others, and how.
         self.made = {
             name: fields[name]
-            for name in scene._numbers()
+            for name in parameter_names(scene)
             if fields[name] is not None and fields[name](scene) == getattr(scene, name)
         }
         expressions = self._stepper.expressions()
         self._motion = {f"motion_{name}": e for name, e in expressions.items()}
         # Functions of parameters must have the same bits everywhere, too.
-        parameters, functions = {n: getattr(scene, n) for n in scene._numbers()}, ElementaryTrace()
+        parameters, functions = parameter_values(scene), ElementaryTrace()
         motion = self._stepper.constants(parameters, functions)
         gone = frozenset(name for name, value in motion.items() if value == 0.0)
         self.derived = self._form.constants(parameters, functions) if self._form else {}
@@ -153,12 +154,13 @@ class UnfusedProgram:
         self._order, self._tolerance = (order // 2, SINGLE_TOLERANCE) if single else (order, TOLERANCE)
         self.states = len(formulas.state)
         self._width = self._form.width if self._form else self.states
-        self._turned = len([n for n in scene._layout.left_out if n in scene._layout.names])
+        layout = layout_of(scene)
+        self._turned = len([n for n in layout.left_out if n in layout.names])
         sizes = (self._width, formulas.targets, formulas.controls, len(formulas.observation), self._turned)
         ends = np.cumsum((0, *sizes)).tolist()
         self.size = ends[-1] + 3
         y, g, u, o, turned = (slice(a, b) for a, b in pairwise(ends))
-        self.rows = Rows(y, g, u, o, turned, *range(ends[-1], self.size))
+        self.rows = ScriptRows(y, g, u, o, turned, *range(ends[-1], self.size))
         self.frames: list[str] = []
 
     # --- scripts --------------------------------------------------------------------------------------------
@@ -244,18 +246,18 @@ class UnfusedProgram:
         inputs = {f"i{n}": value for n, value in enumerate(value for values in given for value in values)}
 
         def recorded(xp: Any, *numbers: Any) -> list:
-            *lists, rest = split(numbers, *sizes)
+            *lists, rest = split_lengths(numbers, *sizes)
             return list(formula(xp, *lists, SimpleNamespace(**dict(zip(self._k, rest, strict=True)))))
 
         return t.formula(recorded, inputs | self._k)
 
     def _derive(self, t: Script) -> None:
-        names = self.task.scene._numbers()
+        names = parameter_names(self.task.scene)
         known: dict[str, Any] = {n: self._place[f"self_{n}"] for n in names if n not in self.made}
         for name, made in self.made.items():
 
             def follows(xp: Any, *numbers: Any, made: Callable = made, given: tuple = tuple(known)) -> list:
-                return [made(_Numbers(self.task.scene, dict(zip(given, numbers, strict=True))))]
+                return [made(_PartlyRecorded(self.task.scene, dict(zip(given, numbers, strict=True))))]
 
             (known[name],) = t.formula(follows, known)
         for name in self.made:
@@ -283,12 +285,12 @@ class UnfusedProgram:
 
     def _moved_starts(self) -> list[str]:
         """Return the start's constants that follow from parameters, if plain arithmetic computes them."""
-        names = list(self.task.scene._numbers())
+        names = list(parameter_names(self.task.scene))
         try:
             found = self._formulas.starts_of(dict(zip(names, ElementaryTrace().inputs(*names), strict=True)))
         except FormulaError:
             return []
-        return [name for name, value in found.items() if isinstance(value, Number)]
+        return [name for name, value in found.items() if isinstance(value, TracedNumber)]
 
     def _start(self, t: Script) -> None:
         formulas, n = self._formulas, self.states
@@ -329,7 +331,7 @@ class UnfusedProgram:
         found = self._run(t, outcome, y, z, u, g)
 
         def turn(xp: Any, turned: Sequence, y: Sequence, z: Sequence, k: Any) -> list:
-            rates = [picture.turning(scene, x) for x in (y, z)]
+            rates = [picture.left_out_rates(scene, x) for x in (y, z)]
             return [
                 x + 0.5 * k.dt * (before + after) for x, before, after in zip(turned, *rates, strict=True)
             ]
@@ -360,7 +362,7 @@ class UnfusedProgram:
         given = dict(zip((*wanted, *moving), self._run(t, prepare, y, u), strict=True))
         inputs = {name: given.get(name) or self._k[f"motion_{name}"] for name in record.given}
         places, velocities = [given[x] for x in moving[:n]], [given[x] for x in moving[n:]]
-        q, v, refused = motion(t, record, inputs, places, velocities, dt, self._order, self._tolerance)
+        q, v, refused = script_motion(t, record, inputs, places, velocities, dt, self._order, self._tolerance)
         return self._run(t, finish, q, v, y, u), refused
 
     def _kick(self, t: Script) -> None:
@@ -387,7 +389,7 @@ class UnfusedProgram:
         ) -> list:
             of = self.task
             if own:
-                of = self._formulas._self(k)
+                of = self._formulas.with_numbers(k)
                 of.formulas = self._formulas  # not the formulas of recorded numbers
             found = picture.poses_of(of, Frame(y, u, of.share(list(u)), list(g), turned), xp)
             return [x for pose in found.values() for x in pose]
@@ -469,7 +471,7 @@ class UnfusedImperfectProgram(UnfusedProgram):
         self._write(t, self.rows.o, self._run(t, shown, draws, seen))
 
 
-class _Numbers:
+class _PartlyRecorded:
     """A scene with some recorded parameters, to compute those that follow from them."""
 
     def __init__(self, scene: Any, numbers: dict[str, Any]) -> None:
@@ -521,7 +523,7 @@ class Unfused:
         """Begin the episode that a new environment would begin with this seed; return the observation."""
         from lag_envs.stepping.primitives import episode_key
 
-        self._key = episode_key(np.uint64(key_of(seed)), np.uint64(1))
+        self._key = episode_key(np.uint64(seed_key(seed)), np.uint64(1))
         self.steps = 0
         program, rest = self.program, np.atleast_1d(self.task.formulas.rest_action).tolist()
         self._waiting = [rest] * program.delay

@@ -26,13 +26,14 @@ from lag_envs.envs.single import (
     check_render_mode,
     check_seed,
     diagnostics,
-    key_of,
     observation_space,
+    seed_key,
     start_options,
     true_spec,
 )
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -123,8 +124,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.diagnostics = diagnostics
         #: TorchRL expects this name, which Gymnasium's own vector environments use.
         self.autoreset_mode = check_mode(autoreset_mode)
-        self._tasks = make_tasks(load_task(task), self.num_envs, options)
-        self.task = self._tasks[0]
+        #: The task of each environment; they differ only in numbers.
+        self.tasks = make_tasks(load_task(task), self.num_envs, options)
+        self.task = self.tasks[0]
         self.scene = self.task.scene
         self.__doc__ = self.task.__doc__
         self.metadata = {
@@ -134,12 +136,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         }
         self._actions = Actions(self.task.formulas)
         self.single_action_space = self._actions.space
-        self.single_observation_space = observation_space(self._tasks)
+        self.single_observation_space = observation_space(self.tasks)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
-        numbers = {id(task): numbers_of(task) for task in {id(t): t for t in self._tasks}.values()}
-        self._constants = [dict(numbers[id(task)]) for task in self._tasks]
+        numbers = {id(task): numbers_of(task) for task in {id(t): t for t in self.tasks}.values()}
+        self._constants = [dict(numbers[id(task)]) for task in self.tasks]
         endless = type(max_episode_steps) is int and max_episode_steps == -1  # Gymnasium's word for it
         if max_episode_steps is not None and not endless:
             steps = float(check_count("max_episode_steps", max_episode_steps))
@@ -154,7 +156,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._memory = on_a_line(np.zeros(blocks * len(program.kept) * BLOCK))
         #: Keys of the seeds, numbers of the episodes, keys of the episodes, and numbers that threads share.
         self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
-        sharing.describe(self._ids, self.num_envs, program.kept)
+        sharing.write_places(self._ids, self.num_envs, program.kept)
         #: Number of the step, counted over all episodes, and how many threads it can keep busy.
         self._turn, self._most_threads = 0, min(blocks, self._num_threads or self.num_envs // sharing.SHARE)
         self._lanes = np.arange(self.num_envs)
@@ -212,12 +214,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         lanes = self._lanes[mask]
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
-            state = np.array([named(i, self._tasks[i].start_state, state[i]) for i in lanes])
+            state = np.array([for_environment(i, self.tasks[i].start_state, state[i]) for i in lanes])
         if target is not None:
             many = self.task.formulas.targets
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
             target = np.array(
-                [np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes]
+                [np.atleast_1d(for_environment(i, self.tasks[i].check_target, target[i])) for i in lanes]
             )
         if not self._started and not mask.all():
             raise ResetNeeded(
@@ -228,7 +230,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._ids[: self.num_envs] = self.np_random.integers(2**63, size=self.num_envs)
         for i, s in seeds:
             if mask[i]:
-                self._ids[i], self._ids[self.num_envs + i] = key_of(s), 0
+                self._ids[i], self._ids[self.num_envs + i] = seed_key(s), 0
         if state is not None:
             for j, column in enumerate(state.T):
                 self._write(f"y{j}", lanes, column)
@@ -371,7 +373,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         ResetNeeded
             Before the first reset, if the mask does not select all environments.
         """
-        snapshots.check(snapshot, self._about, self._program.kept)
+        snapshots.check_snapshot(snapshot, self._about, self._program.kept)
         mask = self._check_mask(mask, "mask")
         if not self._started and not mask.all():
             raise ResetNeeded("call reset() before set_state() with a mask that leaves some out")
@@ -388,7 +390,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         """The properties that a snapshot must share."""
         options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
         limit = self._constants[0]["limit"]
-        return snapshots.about(self._tasks, **options, max_episode_steps=limit, order=self.order)
+        return snapshots.properties(self.tasks, **options, max_episode_steps=limit, order=self.order)
 
     # --- for inspection ------------------------------------------------------------------------------------
 
@@ -435,7 +437,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         The order changes only the speed: each step is certified to the same tolerance with any order.
         """
-        return None if self.scene._form else int(self._pars[0][self._program.uniform.index("x")])
+        return None if form_of(self.scene) else int(self._pars[0][self._program.uniform.index("x")])
 
     @order.setter
     def order(self, value: int) -> None:
@@ -455,10 +457,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: the current pictures, spaces, controls, parameters."""
-        from lag_envs.envs.html import described, still
+        from lag_envs.envs.html import environment_html, still
         from lag_envs.envs.rendering import columns_of, tiled
 
-        shown, pictures = self._tasks[:9], []
+        shown, pictures = self.tasks[:9], []
         columns = columns_of(len(shown))
         targets = self.target if self._started and self.target is not None else [None] * self.num_envs
         for i, task in enumerate(shown):
@@ -468,7 +470,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         title = f"{self.spec.id if self.spec else type(self.task).__name__} × {self.num_envs}"
         spaces = {"observation of each": self.single_observation_space, "action": self.single_action_space}
         grid = tiled(pictures, columns) if pictures else None
-        return described(self.task, title, spaces, grid)
+        return environment_html(self.task, title, spaces, grid)
 
     # --- internal ------------------------------------------------------------------------------------------
 
@@ -477,8 +479,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         size = (WIDTH, HEIGHT) if self._tiles is None else tile_size(self._tiles)
         return tuple(
-            Viewer(task, "rgb_array", self._look, size)
-            for task in self._tasks[: self._tiles or self.num_envs]
+            Viewer(task, "rgb_array", self._look, size) for task in self.tasks[: self._tiles or self.num_envs]
         )
 
     def _use_drawn(self) -> None:
@@ -489,13 +490,23 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                 values = {name: float(column[i]) for name, column in drawn.items()}
                 if self._viewed.get(i) != values:
                     self._viewed[i] = values
-                    viewer.use(self._tasks[i].varied(**values))
+                    viewer.use(self.tasks[i].varied(**values))
 
     def _count(self, rewards: NDArray[np.float64]) -> None:
         """Count steps and rewards of the episodes."""
         begun = self._read("n") == 0.0
         self._steps = np.where(begun, 0, self._steps + 1)
         self._totals = np.where(begun, 0.0, self._totals + rewards)
+
+    @property
+    def ended(self) -> NDArray[np.bool_] | None:
+        """The environments whose episodes are over, as a mask; None if there are none."""
+        return self._read("n") < 0.0 if self._over else None
+
+    @property
+    def limits(self) -> NDArray[np.float64]:
+        """Steps of an episode in each environment; infinity for one without an end."""
+        return np.array([constants["limit"] for constants in self._constants])
 
     def _read(self, row: str) -> NDArray[np.float64]:
         return self._blocks[:, self._row[row]].reshape(-1)[: self.num_envs].copy()
@@ -563,7 +574,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         states, controls = self.state, self.control
         drawn = self.parameters
         for i in self._lanes[mask]:
-            task = self._tasks[i]
+            task = self.tasks[i]
             if drawn:
                 task = task.varied(**{name: float(values[i]) for name, values in drawn.items()})
             infos = self._add_info(infos, diagnostics(task.scene, states[i], controls[i]), int(i))
@@ -572,7 +583,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
         control = self.control[i]
-        error = self._tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
+        error = self.tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
         error.results = results
         return error
 
@@ -603,7 +614,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, and compile anew (from the cache)."""
+        """Restore, and compile again (from the cache)."""
         self.__dict__.update(state)
         sharing.forget_helpers(self._ids, self.num_envs)
         self._compile()
@@ -618,7 +629,7 @@ def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float6
     return copy
 
 
-def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
+def for_environment(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
     """Call a function; if it raises a ValueError, add that this was for environment i."""
     try:
         return function(*arguments, **keywords)
@@ -670,7 +681,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     if not many:
         return [kind(**options)] * n
     own = [options | {name: values[i] for name, values in many.items()} for i in range(n)]
-    tasks = [named(i, kind, **own[i]) for i in range(n)]
+    tasks = [for_environment(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
             "the environments of a batch may differ in numbers only: they must agree in structural options, "

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.imperfections import MOST_DRAWN
 
@@ -44,7 +45,7 @@ class Condition:
         return int(TASKS[env_id](**self.options).limit)
 
     def suits(self, agent: Any, plans: bool) -> bool:
-        """Tell whether an agent can act under this: planning or a memory is tied to one control interval.
+        """Return whether an agent can act under this: planning or a memory is tied to one control interval.
 
         Parameters
         ----------
@@ -88,10 +89,11 @@ def imperfections(env_id: str) -> list[Condition]:
     that the environment already has stay as they are.
     """
     task = TASKS[env_id]()
+    layout = layout_of(task.scene)
     turning = {
         entry.name: 0.02 * task.examples.reach
-        for entry in task.scene._layout.state
-        if entry.unit == "rad/s" and entry.coordinate in task.scene._layout.free
+        for entry in layout.state
+        if entry.unit == "rad/s" and entry.coordinate in layout.free
     }
     hidden = [*_positive(env_id)][:MOST_DRAWN]
     found = {

@@ -23,7 +23,7 @@ class PolicyError(Exception):
     """An agent fails or returns an invalid action; the text says how, and is safe to print."""
 
 
-class Step(NamedTuple):
+class RolloutStep(NamedTuple):
     """The events of one step in a batch of episodes.
 
     Attributes
@@ -98,7 +98,7 @@ class Rollout:
         """The control of the last step."""
         return self.envs.control
 
-    def __iter__(self) -> Iterator[Step]:
+    def __iter__(self) -> Iterator[RolloutStep]:
         """Take the steps, until all episodes have ended."""
         start = self.running.copy()
         while self.running.any():
@@ -106,12 +106,12 @@ class Rollout:
             action, self.memory = act(self.agent, seen, self.memory, start, self.envs.action_space.shape)
             self.observation, reward, terminated, truncated, _ = self.envs.step(action)
             self.returns += np.where(self.running, reward, 0.0)
-            yield Step(seen, action, reward, terminated, truncated, self.running)
+            yield RolloutStep(seen, action, reward, terminated, truncated, self.running)
             self.running = self.running & ~(terminated | truncated)
             start = np.zeros_like(start)
         self.envs.close()
 
-    def run(self, *watchers: Callable[[Step], Any]) -> Array:
+    def run(self, *watchers: Callable[[RolloutStep], Any]) -> Array:
         """Take all steps, show each to the watchers, and return the episodes' returns."""
         for step in self:
             for watch in watchers:
@@ -138,13 +138,13 @@ class Meter:
     def __init__(self, total: int, show: Callable[[int, int], Any]) -> None:
         self.total, self.show, self.done, self.taken = total, show, 0, 0
 
-    def __call__(self, step: Step) -> None:
+    def __call__(self, step: RolloutStep) -> None:
         """Count a step of every episode."""
         self.taken += len(step.running)
         self.show(self.done + self.taken, self.total)
 
     def close(self, size: int) -> None:
-        """Count a roll-out that ended early, or was left out, as one of so many steps."""
+        """Count a roll-out that ended early, or was left out, as one of this many steps."""
         self.done, self.taken = self.done + size, 0
         self.show(self.done, self.total)
 
@@ -214,7 +214,7 @@ class Outcome:
     def _holds(self) -> Mask:
         return self.task.goal_holds(self.rollout.state, self.rollout.target)
 
-    def __call__(self, step: Step) -> None:
+    def __call__(self, step: RolloutStep) -> None:
         """Note a step."""
         self.steps += step.running
         self.effort += np.where(step.running, self.task.effort(self.rollout.control), 0.0)
@@ -289,7 +289,7 @@ class Episodes:
         return np.where(last > self.steps, np.inf, last * self.task.dt)
 
 
-def record(rollout: Rollout, *watchers: Callable[[Step], Any]) -> Episodes:
+def record_rollout(rollout: Rollout, *watchers: Callable[[RolloutStep], Any]) -> Episodes:
     """Take all steps of a roll-out, show each to the watchers, and return a record of it."""
     states, steps = [rollout.state.copy()], []
     for step in rollout:

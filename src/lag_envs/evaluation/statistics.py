@@ -225,10 +225,10 @@ def estimate(groups: Sequence[ArrayLike]) -> dict[str, Any]:
     return {"value": value, "low": low, "high": high, "mean": mean, "error": error, "each": means.tolist()}
 
 
-def rounded(value: Any) -> Any:
+def rounded_data(value: Any) -> Any:
     """Return JSON-like data with numbers rounded to 6 digits; more would be noise and make files large."""
     if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
+        return {k: rounded_data(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [rounded(v) for v in value]
+        return [rounded_data(v) for v in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.evaluation.rollout import Episodes, PolicyError, Rollout, act, record
+from lag_envs.evaluation.rollout import Episodes, PolicyError, Rollout, act, record_rollout
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.policies import Policy
+from lag_envs.leaderboard.policies import SubmittedPolicy
 from lag_envs.leaderboard.submission import Refused, Submission
 
 Array = NDArray[Any]
@@ -50,8 +50,8 @@ FAR = Distance(2.0, 1e9)
 
 
 @dataclass
-class Track:
-    """Where a policy went in the common episodes, and what it did and got.
+class PlayedPolicy:
+    """A policy's states, actions and returns in the common episodes.
 
     Parameters
     ----------
@@ -65,12 +65,12 @@ class Track:
         Whether it has no memory, so that it can be asked at many states at once.
     """
 
-    policy: Policy
+    policy: SubmittedPolicy
     played: Episodes
     returns: Array
     quick: bool
 
-    def asked(self, other: Track) -> float:
+    def asked(self, other: PlayedPolicy) -> float:
         """Return the mean square difference of another's actions on this path, or the largest if it fails."""
         agent, seen, did = other.policy.agent(), self.played.observations, self.played.actions
         start = np.ones(len(self.returns), np.bool_)
@@ -105,18 +105,18 @@ class Track:
         return float(np.mean(off * off))
 
 
-def track(env_id: str, policy: Policy, nonce: str) -> Track:
+def track(env_id: str, policy: SubmittedPolicy, nonce: str) -> PlayedPolicy:
     """Let a policy play the episodes that follow from a nonce; raise Refused if it fails."""
     first = protocol.first_seed(f"alike {env_id}", nonce, 0)
     rollout = Rollout(env_id, policy.agent(), range(first, first + EPISODES))
     try:
-        played = record(rollout)
+        played = record_rollout(rollout)
     except PolicyError as error:
         raise Refused(str(error)) from error
-    return Track(policy, played, rollout.returns, rollout.memory is None)
+    return PlayedPolicy(policy, played, rollout.returns, rollout.memory is None)
 
 
-def distance(a: Track, b: Track, error: float) -> Distance:
+def distance(a: PlayedPolicy, b: PlayedPolicy, error: float) -> Distance:
     """Return how far apart two policies are; for actions that are clearly apart, only a lower bound.
 
     Parameters
@@ -149,12 +149,12 @@ class Likeness:
 
     def __init__(self, env_id: str, nonce: str) -> None:
         self.env_id, self.nonce = env_id, nonce
-        self._tracks: dict[str, list[Track | None]] = {}
+        self._tracks: dict[str, list[PlayedPolicy | None]] = {}
 
-    def tracks(self, submission: Submission) -> list[Track | None]:
+    def tracks(self, submission: Submission) -> list[PlayedPolicy | None]:
         """Return the tracks of a submission's policies, None for one that fails."""
         if submission.digest not in self._tracks:
-            found: list[Track | None] = []
+            found: list[PlayedPolicy | None] = []
             for _, policy in submission.policies:
                 try:
                     found.append(track(self.env_id, policy, self.nonce))

@@ -28,7 +28,7 @@ from pydantic import Field
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, others
-from lag_envs.leaderboard.fields import Strict, checked, plain, shown
+from lag_envs.leaderboard.fields import Strict, ascii_text, checked, shown_ascii
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
     COMMIT,
@@ -36,21 +36,21 @@ from lag_envs.leaderboard.log import (
     MOST,
     REMEDY,
     Added,
+    BoardEntry,
     BoardError,
-    Entry,
+    BoardState,
     Hash,
-    Line,
+    LogLine,
     Opened,
     Protocol,
-    State,
     fold,
     load_json,
     parse,
     read_log,
 )
 from lag_envs.leaderboard.pending import Neighbours, claimed, shown_episodes
-from lag_envs.leaderboard.results import apart, build, compare
-from lag_envs.store import write
+from lag_envs.leaderboard.results import apart, code_digest, compare_results
+from lag_envs.store import write_file
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About
@@ -87,7 +87,7 @@ class Finding:
 # --- what is cheap ------------------------------------------------------------------------------------------
 
 
-def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
+def sound(board: Board, pin: Path | None = None) -> tuple[BoardState, Results]:
     """Return a board's state and its results, by protocol and id, if all cheap checks pass.
 
     Parameters
@@ -113,26 +113,26 @@ def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
 
 
 @dataclass
-class Cheap:
+class CheapChecks:
     """What the cheap checks found, and what they read."""
 
     findings: list[Finding]
     log: bytes = b""
-    lines: list[Line] = field(default_factory=list)
-    state: State = field(default_factory=State)
+    lines: list[LogLine] = field(default_factory=list)
+    state: BoardState = field(default_factory=BoardState)
     results: Results = field(default_factory=dict)
     #: What each submission says of itself, by id.
     abouts: dict[str, About] = field(default_factory=dict)
 
     def chained(self, number: int) -> bool:
-        """Tell whether a line of the log holds the hash of the lines before it."""
+        """Return whether a line of the log holds the hash of the lines before it."""
         return any(line.number == number and line.event.prev is not None for line in self.lines)
 
 
-def cheap(board: Board, pin: Path | None = None) -> Cheap:
+def cheap(board: Board, pin: Path | None = None) -> CheapChecks:
     """Make all cheap checks."""
     chain = Finding("log")
-    found = Cheap([chain])
+    found = CheapChecks([chain])
     try:
         found.log = read_log(board.log)
         found.lines, torn = parse(found.log)
@@ -171,7 +171,7 @@ def write_pin(board: Board, file: Path) -> Pin:
     if not log:
         raise BoardError(f"{board.log} is empty; there is nothing to pin")
     pin = pin_of(log)
-    write(file, json.dumps(pin.model_dump(), indent=2) + "\n")
+    write_file(file, json.dumps(pin.model_dump(), indent=2) + "\n")
     return pin
 
 
@@ -207,7 +207,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
     return found
 
 
-def _submissions(board: Board, found: Cheap) -> Finding:
+def _submissions(board: Board, found: CheapChecks) -> Finding:
     """Compare each submission's files with the log."""
     from lag_envs.leaderboard.submission import Refused, about, digest_of, read_files
 
@@ -233,12 +233,14 @@ def _submissions(board: Board, found: Cheap) -> Finding:
             continue  # it was accepted once; since then its environment, say, has gone
         for name in ("env", "name", "authors", "kind"):
             if (noted := getattr(entry, name)) != (said := getattr(told, name)):
-                finding.wrong.append(f"{where} says {name} {shown(said)}, the log {shown(noted)}; {REMEDY}")
+                finding.wrong.append(
+                    f"{where} says {name} {shown_ascii(said)}, the log {shown_ascii(noted)}; {REMEDY}"
+                )
     finding.told = f"{len(entries)} are what was added"
     return finding
 
 
-def _results(board: Board, found: Cheap) -> Finding:
+def _results(board: Board, found: CheapChecks) -> Finding:
     """Compare each result with the log, with the submission, and with itself."""
     finding = Finding("results")
     for entry in found.state.all:
@@ -261,7 +263,7 @@ def _results(board: Board, found: Cheap) -> Finding:
     return finding
 
 
-def _verified_at(found: Cheap, entry: Entry) -> int:
+def _verified_at(found: CheapChecks, entry: BoardEntry) -> int:
     """Return the line that says that an entry was verified."""
     return next(
         line.number
@@ -270,11 +272,11 @@ def _verified_at(found: Cheap, entry: Entry) -> int:
     )
 
 
-def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]:
+def _odd(found: CheapChecks, entry: BoardEntry, result: Mapping[str, Any]) -> Iterator[str]:
     """Yield statements of a result that cannot be true."""
     for name in ("env", "digest", "nonce"):
         if result[name] != getattr(entry, name):
-            yield f"is of {name} {shown(result[name])}, not {shown(getattr(entry, name))}"
+            yield f"is of {name} {shown_ascii(result[name])}, not {shown_ascii(getattr(entry, name))}"
     if (told := found.state.protocols.get(entry.protocol)) is not None:
         if result["episodes"] != told.rules.episodes:
             yield f"has {result['episodes']} episodes, not {told.rules.episodes}"
@@ -293,7 +295,7 @@ def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]
     seeds = {label: replay["reset_seed"] - first for label, replay in recorded.items()}
     if seeds != chosen or len(result["replays"]) > len(seeds):
         yield "has recorded other episodes than the median, the best and the worst"
-    elif result.get("build") is not None:  # before, those of random actions were drawn anew
+    elif result.get("build") is not None:  # before, those of random actions were redrawn
         for label, i in chosen.items():
             if abs(recorded[label]["return"] - returns[i]) > 1e-3 * max(1.0, abs(returns[i])):
                 yield f"has recorded another {label} episode than was verified"
@@ -320,7 +322,7 @@ def git(folder: Path, *arguments: str) -> bytes:
         raise NoHistory("git takes more than a minute") from None
     except subprocess.CalledProcessError as error:
         said = error.stderr.decode(errors="replace").strip().split("\n")[0]
-        raise NoHistory(f"git says {shown(said)}") from None
+        raise NoHistory(f"git says {shown_ascii(said)}") from None
 
 
 def log_at(folder: Path, commit: str) -> bytes:
@@ -393,12 +395,12 @@ def head_of(board: Board) -> str:
     return commit
 
 
-def _nonces(board: Board, found: Cheap) -> Finding:
+def _nonces(board: Board, found: CheapChecks) -> Finding:
     """Check each nonce's source: its commit must hold everything the nonce decides, and be in the history."""
     finding = Finding("nonces")
     held, elsewhere = 0, []
     for number, value, source in found.state.nonces:
-        where = f"{board.log}, line {number}: the nonce {shown(value)}"
+        where = f"{board.log}, line {number}: the nonce {shown_ascii(value)}"
         if source not in ("", COMMIT):
             elsewhere.append(f"line {number}: {value} by {source}")
             continue
@@ -452,7 +454,7 @@ def audit(
     pin: Path | None = None,
     everything: bool = False,
     tell: Callable[[Finding], Any] = lambda finding: None,
-    progress: Callable[[Entry], Any] = lambda entry: None,
+    progress: Callable[[BoardEntry], Any] = lambda entry: None,
 ) -> bool:
     """Make all checks; return True if nothing is wrong.
 
@@ -483,7 +485,7 @@ def audit(
     return not any(finding.wrong for finding in findings)
 
 
-def _playable(board: Board, found: Cheap) -> Iterator[tuple[Entry, dict[str, Any], float, str]]:
+def _playable(board: Board, found: CheapChecks) -> Iterator[tuple[BoardEntry, dict[str, Any], float, str]]:
     """Yield all that can be verified again: entry, result, best return minus random, place for messages."""
     for (number, id), result in found.results.items():
         entry = found.state.boards[number][id]
@@ -495,7 +497,7 @@ def _playable(board: Board, found: Cheap) -> Iterator[tuple[Entry, dict[str, Any
         yield entry, result, scale.best - scale.random, where
 
 
-def _load(board: Board, entry: Entry) -> Any:
+def _load(board: Board, entry: BoardEntry) -> Any:
     from lag_envs.leaderboard.submission import Refused, load
 
     try:
@@ -505,11 +507,11 @@ def _load(board: Board, entry: Entry) -> Any:
     return submission if submission.digest == entry.digest else None  # otherwise already reported
 
 
-def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
-    """Play the recorded episodes of each policy again, and some more that nobody can foresee."""
+def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
+    """Play the recorded episodes of each policy again, and some more that cannot be foreseen."""
     from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
-    from lag_envs.leaderboard.verify import replay
+    from lag_envs.leaderboard.verify import record_again
 
     finding, draw, played, results = Finding("scores"), random.SystemRandom(), 0, 0
     for entry, result, way, where in _playable(board, found):
@@ -519,14 +521,14 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
         middle, recorded = shown_episodes(result)
         odd: list[str] = []
         # On another build, one of these few episodes may be a different one altogether.
-        tolerated = int(result.get("build") != build())
+        tolerated = int(result.get("build") != code_digest())
         plans = submission.architecture.plans
         for number, policy in enumerate(result["policies"]):
             chosen = draw.sample(range(result["episodes"]), min(SAMPLE, result["episodes"]))
             if number == middle:
                 chosen += [i for i in recorded.values() if i not in chosen]
             try:
-                again, episodes = replay(submission, dict(result), number, chosen)
+                again, episodes = record_again(submission, dict(result), number, chosen)
             except (PolicyError, Refused) as error:
                 odd.append(f"a policy that {error}")
                 continue
@@ -548,13 +550,13 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
                     if not _same_episode(told, made[told["reset_seed"]])
                 ][tolerated:]
         results += 1
-        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} again" for what in odd]
+        finding.wrong += [f"{where} has {ascii_text(what)}; verify {entry.id} again" for what in odd]
     finding.told = f"{played} episodes of {results} results were played again"
     return finding
 
 
 def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
-    """Tell whether two episodes are the same, to the digits that are recorded."""
+    """Return whether two episodes are the same, to the digits that are recorded."""
     if any(len(kept[name]) != len(made[name]) for name in ("states", "actions", "rewards")):
         return False
     if any(kept[name] != made[name] for name in ("seed", "reset_seed", "dt", "target")):
@@ -568,7 +570,7 @@ def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
     )
 
 
-def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
+def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
     """Verify every result again, compare all submissions, and play the references."""
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import verify
@@ -580,9 +582,11 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
             continue
         try:
             again = verify(submission, entry.nonce, result["episodes"])
-            compared = compare(result, again, way, submission.architecture.plans)
+            compared = compare_results(result, again, way, submission.architecture.plans)
         except (Refused, ValueError) as error:
-            finding.wrong.append(f"{where} cannot be verified again: {plain(error)}; withdraw {entry.id}")
+            finding.wrong.append(
+                f"{where} cannot be verified again: {ascii_text(error)}; withdraw {entry.id}"
+            )
             continue
         finding.wrong += [f"{where} differs in {what}; verify {entry.id} again" for what in compared.far]
         same, bits = same + (not compared.far), bits + compared.same
@@ -592,7 +596,7 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
     return finding
 
 
-def _links(board: Board, found: Cheap) -> Iterator[str]:
+def _links(board: Board, found: CheapChecks) -> Iterator[str]:
     """Yield policies that act alike without being noted, or are noted and do not."""
     neighbours = Neighbours(board)
     for entry in found.state.entries.values():
@@ -613,7 +617,7 @@ def _links(board: Board, found: Cheap) -> Iterator[str]:
                 )
 
 
-def _references(found: Cheap) -> Iterator[str]:
+def _references(found: CheapChecks) -> Iterator[str]:
     """Yield references whose mean return is not the one that the log states."""
     from lag_envs.controllers import make_controller
     from lag_envs.evaluation.rollout import play

@@ -31,16 +31,16 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs import store
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import shown
+from lag_envs.leaderboard.fields import shown_ascii
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
     LOG,
     REMEDY,
     Alike,
+    BoardEntry,
     BoardError,
-    Entry,
+    BoardState,
     Protocol,
-    State,
     fold,
     lock,
     locked,
@@ -97,7 +97,7 @@ class Board:
         self.folder = Path(folder)
         self.log = self.folder / LOG
 
-    def read(self) -> State:
+    def read(self) -> BoardState:
         """Return the state that follows from the log; others may be writing to it."""
         return fold(parse(read_log(self.log))[0])
 
@@ -105,7 +105,7 @@ class Board:
         """Return the folder of a submission's files."""
         return self.folder / "submissions" / id
 
-    def result(self, entry: Entry) -> dict[str, Any]:
+    def result(self, entry: BoardEntry) -> dict[str, Any]:
         """Return a verified result; raise a BoardError if the file is not the one that was written then."""
         path = self.result_file(entry)
         try:
@@ -121,7 +121,7 @@ class Board:
         except ValueError as error:
             raise BoardError(f"{path} is not a result: {error}; verify {entry.id} again") from None
 
-    def result_file(self, entry: Entry) -> Path:
+    def result_file(self, entry: BoardEntry) -> Path:
         """Return the path of a submission's result under a protocol."""
         folder = self.folder / "results"
         if entry.protocol > 1:
@@ -129,7 +129,7 @@ class Board:
         return folder / f"{entry.id}.json.gz"
 
     @contextmanager
-    def change(self) -> Iterator[tuple[State, Callable[..., None]]]:
+    def change(self) -> Iterator[tuple[BoardState, Callable[..., None]]]:
         """Hold the board's lock; give its state and a function that appends an event to the log.
 
         Others wait meanwhile. Temporary files left by a kill are removed.
@@ -164,7 +164,7 @@ class Board:
         with self.change() as (state, append):
             return self._open(state, append)
 
-    def _open(self, state: State, append: Callable[..., None]) -> int:
+    def _open(self, state: BoardState, append: Callable[..., None]) -> int:
         from lag_envs.scores import known_returns
 
         known = state.protocols.get(state.number)
@@ -187,7 +187,7 @@ class Board:
         append("protocol", number=number, rules=rules, scales=scales, references=references)
         return number
 
-    def add(self, submission: Submission) -> Entry:
+    def add(self, submission: Submission) -> BoardEntry:
         """Add a submission, unless it is there already, and return its entry.
 
         A board without a protocol begins the first one.
@@ -255,18 +255,18 @@ class Board:
         """
         if not re.fullmatch(r"[!-~]{1,200}", nonce):
             raise BoardError(
-                f"a nonce is 1 to 200 printable ASCII characters without spaces, got {shown(nonce)}"
+                f"a nonce is 1 to 200 printable ASCII characters without spaces, got {shown_ascii(nonce)}"
             )
         with self.change() as (state, append):
             if any(nonce == value for _, value, _ in state.nonces):
                 raise BoardError(
-                    f"the nonce {shown(nonce)} was published before, so it was known; take another"
+                    f"the nonce {shown_ascii(nonce)} was published before, so it was known; take another"
                 )
             append("nonce", value=nonce, source=source)
 
     def verified(
         self, id: str, result: Mapping[str, Any], alike: Mapping[str, Alike | None] | None = None
-    ) -> list[Entry]:
+    ) -> list[BoardEntry]:
         """Keep a result, unless the submission is no longer pending.
 
         It replaces the result of the same authors under the same name on the same board, unless the
@@ -295,7 +295,7 @@ class Board:
             if left := [other for other in others(state, entry) if other.id not in alike]:
                 return left
             path = self.result_file(entry)
-            store.write(path, content, sync=True)
+            store.write_file(path, content, sync=True)
             near = [found for found in alike.values() if found is not None]
             same = [
                 old.id for old in state.entries.values() if old.state == "verified" and same_agent(old, entry)
@@ -323,7 +323,7 @@ class Board:
 
     @contextmanager
     def claimed(self, id: str) -> Iterator[bool]:
-        """Tell whether nobody else is verifying a submission, and keep others from it meanwhile."""
+        """Return whether a submission is free to verify, and lock it if so."""
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
         with ExitStack() as stack:
             try:
@@ -335,7 +335,7 @@ class Board:
             yield free
 
 
-def current(state: State, what: str) -> Protocol:
+def current(state: BoardState, what: str) -> Protocol:
     """Return the current protocol; raise a BoardError if this package has other rules."""
     found = state.protocols.get(state.number)
     if found is None:
@@ -351,8 +351,8 @@ def current(state: State, what: str) -> Protocol:
     return found
 
 
-def others(state: State, entry: Entry) -> list[Entry]:
-    """Return all submissions verified on the same board, whatever became of them."""
+def others(state: BoardState, entry: BoardEntry) -> list[BoardEntry]:
+    """Return all submissions verified on the same board, including those withdrawn or replaced since."""
     return [
         other
         for other in state.boards[entry.protocol].values()

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.board import Board
-from lag_envs.leaderboard.log import COMMIT, BoardError, Entry, State
-from lag_envs.leaderboard.pending import Check, finish
+from lag_envs.leaderboard.log import COMMIT, BoardEntry, BoardError, BoardState
+from lag_envs.leaderboard.pending import PendingCheck, finish
 from lag_envs.leaderboard.standings import board_data, page_data
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 #: Examples of each action, the simplest use first.
 EXAMPLES = {
@@ -148,7 +148,7 @@ def _positive(text: str) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.fields import plain
+    from lag_envs.leaderboard.fields import ascii_text
     from lag_envs.leaderboard.submission import Refused, load
 
     board = Board(args.board)
@@ -158,7 +158,7 @@ def _add(args: argparse.Namespace) -> int:
             entry = board.add(load(folder))
         except (Refused, BoardError, OSError) as error:
             failed += 1
-            print(f"{plain(folder)}: refused: {error}", file=sys.stderr)
+            print(f"{ascii_text(folder)}: refused: {error}", file=sys.stderr)
             continue
         added.append(entry.id)
         if entry.state != "pending":
@@ -216,10 +216,10 @@ def _open(args: argparse.Namespace) -> int:
 def _finish(board: Board, args: argparse.Namespace) -> int:
     """Verify pending submissions, with progress on a terminal; return how many could not be verified."""
 
-    def tell(entry: Entry, what: str) -> None:
+    def tell(entry: BoardEntry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
 
-    def parallel_map(check: Check, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
+    def parallel_map(check: PendingCheck, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
         from tqdm import tqdm
 
         from lag_envs.leaderboard.parallel import map_submissions
@@ -267,7 +267,7 @@ def _list(args: argparse.Namespace) -> int:
             told = (row["kind"], _plain(row["name"]), row["id"] + _remark(row))
             rank = "-" if row["rank"] is None else str(row["rank"])
             lines.append((rank, f"{row['score']:.4f}", ends, success, *told))
-        print("\n".join("  " + line for line in columns(lines)), end="\n" * bool(lines))
+        print("\n".join("  " + line for line in aligned(lines)), end="\n" * bool(lines))
         for other in found["other"]:
             reason = f": {_plain(other['reason'])}" if other["reason"] else ""
             print(f"  {other['id']} {other['state']}{reason}")
@@ -275,7 +275,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _remark(row: dict[str, Any]) -> str:
-    """Return what sets a row apart, in words."""
+    """Describe what distinguishes a row."""
     remarks = []
     if row["alike"]:
         remarks.append(f"acts like {row['alike']['id']}")
@@ -286,7 +286,7 @@ def _remark(row: dict[str, Any]) -> str:
     return f" ({'; '.join(remarks)})" if remarks else ""
 
 
-def _some(board: Board) -> State:
+def _some(board: Board) -> BoardState:
     """Return the board's state; raise a BoardError if nothing is on it."""
     from lag_envs.leaderboard.audit import sound
 
@@ -342,7 +342,7 @@ def _show(args: argparse.Namespace) -> int:
         for key, value in (told | row).items()
         if value not in (None, "", False)
     ]
-    print("\n".join(columns([(key, _plain(value)) for key, value in shown])))
+    print("\n".join(aligned([(key, _plain(value)) for key, value in shown])))
     return 0
 
 
@@ -400,9 +400,9 @@ def _pin(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.site.build import build
+    from lag_envs.leaderboard.site.build import write_page
 
-    build(page_data(Board(args.board)), args.out, args.url)
+    write_page(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0
 
@@ -412,14 +412,14 @@ def _serve(args: argparse.Namespace) -> int:
     from functools import partial
     from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
-    from lag_envs.leaderboard.site.build import build
+    from lag_envs.leaderboard.site.build import write_page
 
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *args: Any) -> None:
             pass
 
     with tempfile.TemporaryDirectory() as folder:
-        build(page_data(Board(args.board)), Path(folder))
+        write_page(page_data(Board(args.board)), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except (OSError, OverflowError) as error:

@@ -23,14 +23,14 @@ Array = NDArray[np.float64]
 LEVELS = (0.5, 0.9, 0.99)
 
 
-class Agent(NamedTuple):
+class AgentIdentity(NamedTuple):
     """An agent: its name and authors."""
 
     name: str
     authors: tuple[str, ...]
 
 
-class Result(NamedTuple):
+class AgentScore(NamedTuple):
     """An agent's result on a board: the score, bootstrap samples of it, and the row's kind."""
 
     score: float
@@ -38,7 +38,7 @@ class Result(NamedTuple):
     kind: str
 
 
-def combined(boards: Mapping[str, Mapping[Agent, Result]]) -> list[dict[str, Any]]:
+def combined(boards: Mapping[str, Mapping[AgentIdentity, AgentScore]]) -> list[dict[str, Any]]:
     """Return the agents in the order of their combined scores, in JSON types.
 
     Parameters

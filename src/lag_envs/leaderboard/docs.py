@@ -16,7 +16,7 @@ from lag_envs.generated import replaced
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import boards
 from lag_envs.leaderboard.standings import board_data
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
     for path, text in generated(parser.parse_args(arguments).project).items():
-        write(path, text)
+        write_file(path, text)
     return 0
 
 
@@ -58,7 +58,7 @@ def together(data: dict[str, Any]) -> str:
     rows = [
         [
             str(number),
-            plain(row["name"]),
+            plain_markdown(row["name"]),
             _scored(row, 3),
             f"{row['boards']} of {row['of']}",
             f"{row['there']:.3f}",
@@ -79,7 +79,8 @@ def top(data: dict[str, Any]) -> str:
         learned = [row for row in best if row["kind"] == "learned"][:1]
         if first:
             names = [
-                ", ".join(f"{plain(row['name'])} {_scored(row)}" for row in some) for some in (first, learned)
+                ", ".join(f"{plain_markdown(row['name'])} {_scored(row)}" for row in some)
+                for some in (first, learned)
             ]
             rows.append([environment["id"], *names])
     if not rows:
@@ -88,7 +89,7 @@ def top(data: dict[str, Any]) -> str:
 
 
 def _listed(rows: Sequence[dict[str, Any]]) -> str:
-    return ", ".join(f"{plain(row['name'])} {_scored(row)}" for row in rows)
+    return ", ".join(f"{plain_markdown(row['name'])} {_scored(row)}" for row in rows)
 
 
 def _scored(row: dict[str, Any], digits: int = 4) -> str:
@@ -103,7 +104,7 @@ def goals() -> str:
     return markdown_table(("environment", "success and time"), rows)
 
 
-def plain(text: str) -> str:
+def plain_markdown(text: str) -> str:
     """Return text that Markdown and HTML show as it is."""
     escaped = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return "".join("\\" + c if c in "\\`*_{}[]()#!~" else c for c in " ".join(escaped.split()))

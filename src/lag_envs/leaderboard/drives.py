@@ -1,4 +1,4 @@
-"""The best drives by hand: links in the board's ``drives.txt``, recomputed whenever the page is built.
+"""The best human drives: links in the board's ``drives.txt``, recomputed whenever the page is built.
 
 A line is a link and the driver's name, with white space between. Empty lines and those that begin with ``# ``
 are ignored.

@@ -37,7 +37,7 @@ def between(low: float, high: float) -> Any:
     return Field(ge=low, le=high)
 
 
-def many(least: int, most: int) -> Any:
+def length_between(least: int, most: int) -> Any:
     """Require a list's length to be from least to most."""
     return Field(min_length=least, max_length=most)
 
@@ -49,11 +49,11 @@ def checked(kind: Any, value: Any) -> Any:
         return adapter.validate_python(value)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        place = shown(".".join(map(str, first["loc"])))[1:-1]
+        place = shown_ascii(".".join(map(str, first["loc"])))[1:-1]
         if what := _PLAINER.get(first["type"]):
             raise ValueError(f"{place} {what}") from None
         rule = first["msg"].removeprefix("Value error, ")
-        raise ValueError(f"{place}: {rule}, got {shown(first['input'])}".removeprefix(": ")) from None
+        raise ValueError(f"{place}: {rule}, got {shown_ascii(first['input'])}".removeprefix(": ")) from None
 
 
 def accepted(kind: Any, value: Any, where: str) -> Any:
@@ -64,7 +64,7 @@ def accepted(kind: Any, value: Any, where: str) -> Any:
         raise Refused(f"{where}: {error}") from None
 
 
-def shown(value: Any) -> str:
+def shown_ascii(value: Any) -> str:
     """Return a value for a message: short, in ASCII, without anything that a terminal would act on."""
     if isinstance(value, dict | list):
         return f"a {'table' if isinstance(value, dict) else 'list'} of {len(value)}"
@@ -72,6 +72,6 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def plain(text: object) -> str:
+def ascii_text(text: object) -> str:
     """Return a text in ASCII, without anything that a terminal would act on."""
     return ascii(str(text))[1:-1]

@@ -13,7 +13,7 @@ from pydantic import model_validator
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.controllers.lookahead import Clocked, LookAhead
 from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, Head, PolicyTable
-from lag_envs.leaderboard.fields import between, line, many, shown
+from lag_envs.leaderboard.fields import between, length_between, line, shown_ascii
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -22,7 +22,7 @@ from lag_envs.tasks.base import Task
 class GridTable(PolicyTable):
     """The table ``[policy]`` of numbers on a grid."""
 
-    axes: Annotated[list[Annotated[str, line(40)]], many(1, 5)]
+    axes: Annotated[list[Annotated[str, line(40)]], length_between(1, 5)]
     kind: Literal["action", "value"]
     actions: Annotated[int, between(3, 21)] = 11
     mirror: str = ""
@@ -34,11 +34,11 @@ class GridTable(PolicyTable):
         if self.kind == "action" and "actions" in self.model_fields_set:
             raise ValueError("actions means nothing in a table of actions; leave it out")
         if self.mirror not in ("", *(set(self.axes) - {"time"})):
-            raise ValueError(f"mirror must be one of the axes and not time, not {shown(self.mirror)}")
+            raise ValueError(f"mirror must be one of the axes and not time, not {shown_ascii(self.mirror)}")
         return self
 
 
-class Table(Architecture):
+class GridArchitecture(Architecture):
     """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, those of the edge.
 
     In the table: `axes`, a list of the axes: a state by its name (`lag-envs info ID`), ``target``, a state
@@ -78,7 +78,7 @@ class Table(Architecture):
         self.axes = tuple(table.axes)
         for axis in self.axes:
             if axis not in known:
-                raise Refused(f"{POLICY}: axes must be of {', '.join(known)}; got {shown(axis)}")
+                raise Refused(f"{POLICY}: axes must be of {', '.join(known)}; got {shown_ascii(axis)}")
         self.kind, self.actions, mirror = table.kind, table.actions, table.mirror
         #: For each axis, its coefficients of (*states, target, time): 0, 1 or -1.
         self.sums = np.zeros((len(self.axes), len(names) + 2))
@@ -99,7 +99,7 @@ class Table(Architecture):
         for j, axis in enumerate(axes):
             if not (axis[1:] > axis[:-1]).all():
                 raise Refused(f"the nodes of axis_{j} must increase")
-        grid = _Grid(self, axes, arrays["table"])
+        grid = _GridValues(self, axes, arrays["table"])
         if self.kind == "action":
             return _LookUp(self.task, grid)
         listed, largest = self.head.choices, self.head.largest
@@ -107,10 +107,10 @@ class Table(Architecture):
         return LookAhead(self.task, grid.value, tried)
 
 
-class _Grid:
+class _GridValues:
     """Numbers over a grid."""
 
-    def __init__(self, about: Table, axes: list[Array], values: Array) -> None:
+    def __init__(self, about: GridArchitecture, axes: list[Array], values: Array) -> None:
         self.about, self.axes, self.wrapped = about, axes, ObservationDecoder(about.task).wrapped
         self.strides = np.array([math.prod(values.shape[j + 1 :]) for j in range(values.ndim)])
         self.values = np.ascontiguousarray(values).reshape(-1)
@@ -149,7 +149,7 @@ class _Grid:
 class _LookUp(Clocked):
     """Reads actions off a grid."""
 
-    def __init__(self, task: Task, grid: _Grid) -> None:
+    def __init__(self, task: Task, grid: _GridValues) -> None:
         super().__init__(task)
         self.grid = grid
 

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
 from lag_envs.leaderboard import fields
-from lag_envs.leaderboard.fields import Strict, between, checked, shown
+from lag_envs.leaderboard.fields import Strict, between, checked, shown_ascii
 from lag_envs.leaderboard.files import read_plain
 
 LOG = "board.jsonl"
@@ -69,7 +69,7 @@ class Event(Strict):
     prev: Hash | None = None
 
 
-class Scale(Strict):
+class LoggedScale(Strict):
     """The mean returns that are scores 0 and 1, frozen when a protocol begins."""
 
     random: Number
@@ -83,8 +83,8 @@ class Scale(Strict):
         return self
 
 
-class Reference(Strict):
-    """The controller that plays everybody's episodes, its mean return, and that mean's standard error."""
+class LoggedReference(Strict):
+    """The controller that plays the same episodes as the submissions, its mean return and its error."""
 
     controller: Name
     mean: Number
@@ -107,8 +107,8 @@ class Protocol(Event):
     event: Literal["protocol"]
     number: Annotated[int, between(1, 10**6)]
     rules: Rules
-    scales: dict[EnvId, Scale]
-    references: dict[EnvId, Reference]
+    scales: dict[EnvId, LoggedScale]
+    references: dict[EnvId, LoggedReference]
 
 
 class Opened(Event):
@@ -117,8 +117,8 @@ class Opened(Event):
     event: Literal["opened"]
     number: Annotated[int, between(1, 10**6)]
     success: dict[EnvId, Text]
-    scales: dict[EnvId, Scale]
-    references: dict[EnvId, Reference]
+    scales: dict[EnvId, LoggedScale]
+    references: dict[EnvId, LoggedReference]
 
 
 class Added(Event):
@@ -208,14 +208,14 @@ def load_json(content: bytes) -> Any:
 
 
 @dataclass(frozen=True)
-class Line:
+class LogLine:
     """An event and the number of its line, from 1."""
 
     number: int
     event: Any
 
 
-def parse(log: bytes) -> tuple[list[Line], bytes]:
+def parse(log: bytes) -> tuple[list[LogLine], bytes]:
     """Return the events of a log, and the torn end that a kill may have left.
 
     Raises
@@ -226,7 +226,7 @@ def parse(log: bytes) -> tuple[list[Line], bytes]:
     """
     *whole, tail = log.split(b"\n")
     before, chained = hashlib.sha256(), False
-    lines: list[Line] = []
+    lines: list[LogLine] = []
     for number, line in enumerate([*whole, tail], 1):
         last = number > len(whole)
         if line.strip():
@@ -235,14 +235,14 @@ def parse(log: bytes) -> tuple[list[Line], bytes]:
             except ValueError as error:
                 if last:
                     return lines, tail
-                told = shown(line[:60].decode(errors="replace"))
+                told = shown_ascii(line[:60].decode(errors="replace"))
                 raise _damaged(number, f"is no event ({error}): {told}") from None
             if chained and event.prev is None:
                 raise _damaged(number, "holds no hash of the lines before it")
             if event.prev is not None and event.prev != before.hexdigest():
                 raise _damaged(number, "is not what followed the lines before it: one of these was changed")
             chained = event.prev is not None
-            lines.append(Line(number, event))
+            lines.append(LogLine(number, event))
         before.update(line if last else line + b"\n")
     return lines, b""
 
@@ -255,7 +255,7 @@ def _damaged(number: int, what: str) -> BoardError:
 
 
 @dataclass(frozen=True)
-class Entry:
+class BoardEntry:
     """A submission on the board of a protocol.
 
     Parameters
@@ -300,7 +300,7 @@ class Entry:
 
 
 @dataclass
-class State:
+class BoardState:
     """The state that follows from the log."""
 
     #: The current protocol; 0 where there is none yet.
@@ -309,36 +309,38 @@ class State:
     #: not yet.
     protocols: dict[int, Protocol] = field(default_factory=dict)
     #: The submissions under each protocol, by id.
-    boards: dict[int, dict[str, Entry]] = field(default_factory=dict)
+    boards: dict[int, dict[str, BoardEntry]] = field(default_factory=dict)
     #: Line, value and source of each nonce.
     nonces: list[tuple[int, str, str]] = field(default_factory=list)
     last: str = ""
 
     @property
-    def entries(self) -> dict[str, Entry]:
+    def entries(self) -> dict[str, BoardEntry]:
         """The submissions under the current protocol, by id."""
         return self.boards.setdefault(self.number, {})
 
     @property
-    def all(self) -> list[Entry]:
+    def all(self) -> list[BoardEntry]:
         """All entries, those under earlier protocols first."""
         return [entry for number in sorted(self.boards) for entry in self.boards[number].values()]
 
-    def entry(self, id: str) -> Entry:
+    def entry(self, id: str) -> BoardEntry:
         """Return an entry under the current protocol, or raise a BoardError."""
         if id not in self.entries:
-            raise BoardError(f"there is no {shown(id)} on the board; `lag-envs leaderboard list` names all")
+            raise BoardError(
+                f"there is no {shown_ascii(id)} on the board; `lag-envs leaderboard list` names all"
+            )
         return self.entries[id]
 
-    def nonce(self, entry: Entry) -> str | None:
+    def nonce(self, entry: BoardEntry) -> str | None:
         """Return the first nonce that was published after a submission was added."""
         return next((value for line, value, _ in self.nonces if line > entry.since), None)
 
-    def waiting(self) -> list[Entry]:
+    def waiting(self) -> list[BoardEntry]:
         """Return what is pending, the oldest first."""
         return [entry for entry in self.entries.values() if entry.state == "pending"]
 
-    def first(self, entry: Entry) -> Entry | None:
+    def first(self, entry: BoardEntry) -> BoardEntry | None:
         """Return the first submission that acts like this one, None if that is this one.
 
         Likeness is noted with the one that was verified later; the one that was added later is linked. Links
@@ -354,7 +356,7 @@ class State:
         return self.first(oldest) or oldest
 
 
-def fold(lines: Sequence[Line]) -> State:
+def fold(lines: Sequence[LogLine]) -> BoardState:
     """Return the state that follows from events.
 
     Raises
@@ -362,7 +364,7 @@ def fold(lines: Sequence[Line]) -> State:
     BoardError
         If an event contradicts those before it; the text names its line.
     """
-    state = State()
+    state = BoardState()
     for line in lines:
         try:
             _apply(state, line.event, line.number)
@@ -371,7 +373,7 @@ def fold(lines: Sequence[Line]) -> State:
     return state
 
 
-def _apply(state: State, event: Any, line: int) -> None:
+def _apply(state: BoardState, event: Any, line: int) -> None:
     """Apply one event to the state; raise a ValueError if it cannot follow."""
     if event.at < state.last:
         raise ValueError(f"{event.at} is earlier than the line before it")
@@ -382,7 +384,7 @@ def _apply(state: State, event: Any, line: int) -> None:
         _join(state, event)
     elif isinstance(event, Nonce):
         if any(event.value == value for _, value, _ in state.nonces):
-            raise ValueError(f"the nonce {shown(event.value)} was published before, so it was known")
+            raise ValueError(f"the nonce {shown_ascii(event.value)} was published before, so it was known")
         state.nonces.append((line, event.value, event.source))
     elif isinstance(event, Added):
         _add(state, event, line)
@@ -390,7 +392,7 @@ def _apply(state: State, event: Any, line: int) -> None:
         _change(state, event)
 
 
-def _begin(state: State, event: Protocol, line: int) -> None:
+def _begin(state: BoardState, event: Protocol, line: int) -> None:
     known = state.number in state.protocols
     wanted = state.number + 1 if known or not state.number else state.number
     if event.number != wanted:
@@ -412,7 +414,7 @@ def _begin(state: State, event: Protocol, line: int) -> None:
     state.boards[event.number] = carried
 
 
-def _join(state: State, event: Opened) -> None:
+def _join(state: BoardState, event: Opened) -> None:
     known = state.protocols.get(state.number)
     if known is None or event.number != state.number:
         raise ValueError(f"boards join protocol {event.number}, the current is {state.number}")
@@ -425,7 +427,7 @@ def _join(state: State, event: Opened) -> None:
     )
 
 
-def _add(state: State, event: Added, line: int) -> None:
+def _add(state: BoardState, event: Added, line: int) -> None:
     if not state.number:  # a log from before protocols had lines
         state.number = 1
     if event.protocol != state.number:
@@ -435,7 +437,7 @@ def _add(state: State, event: Added, line: int) -> None:
     known = state.entries.get(event.id)
     told = {key: getattr(event, key) for key in ("env", "protocol", "name", "kind", "digest")}
     if known is None:
-        state.entries[event.id] = Entry(
+        state.entries[event.id] = BoardEntry(
             event.id, **told, authors=tuple(event.authors), added=event.at, line=line, since=line
         )
         return
@@ -455,7 +457,7 @@ def _add(state: State, event: Added, line: int) -> None:
     state.entries[event.id] = back
 
 
-def _change(state: State, event: Verified | Rejected | Withdrawn) -> None:
+def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
     known = state.entries.get(event.id)
     if known is None:
         raise ValueError(f"{event.id} is {event.event}, and was never added; restore the line that adds it")
@@ -470,11 +472,15 @@ def _change(state: State, event: Verified | Rejected | Withdrawn) -> None:
         state.entries[event.id] = replace(known, state="rejected", reason=event.reason)
         return
     if event.nonce != state.nonce(known):
-        raise ValueError(f"{event.id} is verified with the nonce {shown(event.nonce)}, which is not its own")
+        raise ValueError(
+            f"{event.id} is verified with the nonce {shown_ascii(event.nonce)}, which is not its own"
+        )
     for old in [*event.supersedes, *(like.id for like in event.alike)]:
         other = state.entries.get(old)
         if other is None or old == event.id or not other.sha256 or other.env != known.env:
-            raise ValueError(f"{event.id} is verified beside {old}, which is no other result of its board")
+            raise ValueError(
+                f"{event.id} is verified in place of {old}, which is not another result of its board"
+            )
     state.entries[event.id] = replace(
         known, state="verified", nonce=event.nonce, sha256=event.sha256, alike=tuple(event.alike)
     )
@@ -485,8 +491,8 @@ def _change(state: State, event: Verified | Rejected | Withdrawn) -> None:
         state.entries[old] = replace(other, state="superseded", reason=f"by {event.id}")
 
 
-def same_agent(entry: Entry, other: Entry) -> bool:
-    """Tell whether two are the same authors' of the same name, on the same board."""
+def same_agent(entry: BoardEntry, other: BoardEntry) -> bool:
+    """Return whether two are the same authors' of the same name, on the same board."""
     return (entry.env, entry.name, sorted(entry.authors)) == (other.env, other.name, sorted(other.authors))
 
 
@@ -560,7 +566,7 @@ def read_all(file: int) -> bytes:
     return b"".join(parts)
 
 
-def write_event(log: int, told: dict[str, Any]) -> Line:
+def write_event(log: int, told: dict[str, Any]) -> LogLine:
     """Append an event as a line and flush it to the disk, all or nothing.
 
     Raises
@@ -587,4 +593,4 @@ def write_event(log: int, told: dict[str, Any]) -> Line:
         os.ftruncate(log, len(content))
         raise
     os.fsync(log)
-    return Line((content + line).count(b"\n"), event)
+    return LogLine((content + line).count(b"\n"), event)

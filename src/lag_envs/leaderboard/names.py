@@ -45,7 +45,7 @@ def unreadable(text: str) -> str:
 
 
 def wordless(text: str) -> bool:
-    """Tell whether a text has no letter and no digit.
+    """Return whether a text has no letter and no digit.
 
     Examples
     --------

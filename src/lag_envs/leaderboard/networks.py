@@ -20,7 +20,7 @@ from lag_envs.leaderboard.architecture import (
     PolicyTable,
     Remembering,
 )
-from lag_envs.leaderboard.fields import Strict, between, many
+from lag_envs.leaderboard.fields import Strict, between, length_between
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -55,7 +55,7 @@ class Normalise(Strict):
 class NetworkTable(PolicyTable):
     """The fields that all networks' tables share."""
 
-    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)]
+    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], length_between(0, protocol.LAYERS)]
     activation: Literal["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"] = "tanh"
     bins: Annotated[int, between(2, 1_001)] | None = None
     squash: Literal["clip", "tanh"] | None = None
@@ -66,7 +66,7 @@ class NetworkTable(PolicyTable):
     def _fit(self) -> Self:
         given = self.model_fields_set & {"squash", "mean_limit"}
         if self.bins and given:
-            raise ValueError(f"{min(given)} means nothing beside bins; leave it out")
+            raise ValueError(f"{min(given)} has no effect with bins; leave it out")
         return self
 
 
@@ -87,9 +87,9 @@ class GRUTable(NetworkTable):
     """The table of a network with a gated recurrent unit."""
 
     memory: Annotated[int, between(1, protocol.MEMORY)]
-    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)] = Field(
-        default=[]
-    )
+    hidden: Annotated[
+        list[Annotated[int, between(1, protocol.WIDTH)]], length_between(0, protocol.LAYERS)
+    ] = Field(default=[])
 
 
 class Network(Architecture):
@@ -98,7 +98,7 @@ class Network(Architecture):
     counts_as = "learned"
 
     def _layers(self, task: Task, table: NetworkTable, wide: int, features: int) -> None:
-        """Read the table and set the arrays of layers that take so many `features`.
+        """Read the table and set the arrays of layers that take this many `features`.
 
         Observations to normalise have length `wide`.
         """
@@ -137,8 +137,8 @@ class MLP(Network):
 
     In the table: `hidden`, the layers' widths, none for a linear map; `activation`; `squash`, "clip" or
     "tanh"; `mean_limit`, optional, to which the last layer's output is clipped before squashing (the mean
-    under SAC's gSDE); `bins`, instead of squashing: [-1, 1] is cut into so many equal parts, the network has
-    an output for each, and the largest output chooses the centre of its part; and the table ``normalise``
+    under SAC's gSDE); `bins`, instead of squashing: [-1, 1] is cut into this many equal parts, the network
+    has an output for each, and the largest output chooses the centre of its part; and the table ``normalise``
     with `epsilon` and `clip`: then the network sees (o - obs_mean)/√(obs_var + epsilon), clipped. If actions
     are listed, the network has an output for each value of each list, the largest of which chooses, and there
     is no `squash`, `mean_limit` or `bins`.
@@ -163,7 +163,7 @@ class MLP(Network):
 
     def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
         layers = _Layers(self, arrays)
-        return _Plain(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
+        return _Feedforward(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
 
 
 class GRU(Network):
@@ -240,7 +240,7 @@ class _Layers:
         return self.head.largest * np.tanh(x) if self.made.squash == "tanh" else x
 
 
-class _Plain(Agent):
+class _Feedforward(Agent):
     def __init__(self, layers: _Layers) -> None:
         super().__init__(layers.head)
         self.layers, self.centres = layers, layers.centres
@@ -310,12 +310,12 @@ class Linear(Architecture):
         count = self.head.size
         self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
 
-    def agent(self, arrays: Mapping[str, Array]) -> _Feedback:
+    def agent(self, arrays: Mapping[str, Array]) -> _LinearFeedback:
         """Return the feedback."""
-        return _Feedback(self.head, arrays["gain"], arrays["offset"])
+        return _LinearFeedback(self.head, arrays["gain"], arrays["offset"])
 
 
-class _Feedback(Agent):
+class _LinearFeedback(Agent):
     def __init__(self, head: Head, gain: Array, offset: Array) -> None:
         super().__init__(head)
         self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))

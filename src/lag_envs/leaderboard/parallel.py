@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.protocol import FOLDER_BYTES
-from lag_envs.workers import cluster, outcomes, processes
+from lag_envs.workers import as_they_finish, cluster, processes
 
 Work = Callable[[Path], Any]
 
@@ -53,10 +53,10 @@ def map_submissions(
                     yield folder, _caught(function, folder)
                 else:
                     futures[submit(_unpacked, function, folder.name, files)] = folder
-            yield from outcomes(futures)
+            yield from as_they_finish(futures)
     elif jobs > 1 and len(folders) > 1:
         with processes(min(jobs, len(folders))) as submit:
-            yield from outcomes({submit(function, folder): folder for folder in folders})
+            yield from as_they_finish({submit(function, folder): folder for folder in folders})
     else:
         for folder in folders:
             yield folder, _caught(function, folder)

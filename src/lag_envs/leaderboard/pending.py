@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, closed, current
-from lag_envs.leaderboard.log import REMEDY, Alike, BoardError, Entry
-from lag_envs.leaderboard.results import check
+from lag_envs.leaderboard.log import REMEDY, Alike, BoardEntry, BoardError
+from lag_envs.leaderboard.results import checked_result
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About, Submission
 
 
 @dataclass(frozen=True)
-class Check:
+class PendingCheck:
     """Process a pending submission, here or on another machine.
 
     Parameters
@@ -43,11 +43,13 @@ class Check:
         check_twins(submission, nonce)
         result = verify(submission, nonce, protocol.EPISODES, progress)
         # A result that the board cannot keep fails here, without harm to the others.
-        return check(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
+        return checked_result(
+            result | {"claimed": claimed(submission), "replays": replays(submission, result)}
+        )
 
 
 def claimed(submission: About) -> dict[str, Any]:
-    """Return a submission's statements about itself, which nobody verified."""
+    """Return a submission's unverified statements about itself."""
     training = submission.training
     return {
         "code": submission.code or None,
@@ -65,10 +67,10 @@ def claimed(submission: About) -> dict[str, Any]:
 
 def replays(submission: Submission, result: dict[str, Any]) -> list[dict[str, Any]]:
     """Return recordings of the median policy's median, best and worst episode."""
-    from lag_envs.leaderboard.verify import replay
+    from lag_envs.leaderboard.verify import record_again
 
     policy, chosen = shown_episodes(result)
-    _, found = replay(submission, result, policy, list(chosen.values()))
+    _, found = record_again(submission, result, policy, list(chosen.values()))
     return [{"label": label} | episode for label, episode in zip(chosen, found, strict=True)]
 
 
@@ -87,7 +89,7 @@ def finish(
     board: Board,
     only: Sequence[str] | None = None,
     parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
-    tell: Callable[[Entry, str], Any] = lambda entry, what: None,
+    tell: Callable[[BoardEntry, str], Any] = lambda entry, what: None,
 ) -> int:
     """Verify all pending submissions that have a nonce.
 
@@ -115,7 +117,7 @@ def finish(
     if state.waiting():
         current(state, "verify submissions of")
     with ExitStack() as claims:
-        claimed_here: dict[str, tuple[Entry, str]] = {}
+        claimed_here: dict[str, tuple[BoardEntry, str]] = {}
         for entry in state.waiting():
             if only is not None and entry.id not in only:
                 continue
@@ -131,7 +133,7 @@ def finish(
                     claimed_here[entry.id] = entry, nonce
                     continue
             tell(entry, _outcome(board, entry))
-        work = Check({id: (entry.digest, nonce) for id, (entry, nonce) in claimed_here.items()})
+        work = PendingCheck({id: (entry.digest, nonce) for id, (entry, nonce) in claimed_here.items()})
         folders = [board.submission(id) for id in claimed_here]
         neighbours = Neighbours(board)
         for folder, result in (parallel_map or partial(map_submissions, jobs=1))(work, folders):
@@ -165,7 +167,7 @@ class Neighbours:
         self._loaded: dict[str, Submission] = {}
         self._likeness: dict[tuple[str, str], Any] = {}
 
-    def alike(self, entry: Entry, result: Mapping[str, Any], other: Entry) -> Alike | None:
+    def alike(self, entry: BoardEntry, result: Mapping[str, Any], other: BoardEntry) -> Alike | None:
         """Return how near another submission is to one that was just verified; None if they are not alike."""
         from lag_envs.leaderboard.alike import Likeness
         from lag_envs.leaderboard.ranking import policy_error
@@ -182,7 +184,7 @@ class Neighbours:
             return None
         return Alike(id=other.id, actions=found.actions, returns=found.returns)
 
-    def _load(self, entry: Entry) -> Submission:
+    def _load(self, entry: BoardEntry) -> Submission:
         from lag_envs.leaderboard.submission import Refused, load
 
         if entry.id not in self._loaded:
@@ -196,7 +198,7 @@ class Neighbours:
         return self._loaded[entry.id]
 
 
-def _outcome(board: Board, entry: Entry) -> str:
+def _outcome(board: Board, entry: BoardEntry) -> str:
     now = board.read().entry(entry.id)
     if now.state == "pending":
         return "pending, until a nonce is published: `lag-envs leaderboard nonce`"

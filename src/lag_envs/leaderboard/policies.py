@@ -30,17 +30,17 @@ import numpy as np
 from pydantic import Field, create_model
 
 from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
-from lag_envs.leaderboard.fields import Strict, accepted, between, shown
-from lag_envs.leaderboard.grids import Table
+from lag_envs.leaderboard.fields import Strict, accepted, between, shown_ascii
+from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, MLP, Linear
 from lag_envs.leaderboard.planning import PlanAhead
 from lag_envs.leaderboard.protocol import Refused
-from lag_envs.leaderboard.tracking import Plan
+from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.tasks import TASKS, resolve
 
 
 @dataclass(frozen=True)
-class Policy:
+class SubmittedPolicy:
     """An architecture with its arrays.
 
     Parameters
@@ -70,7 +70,7 @@ def architecture(env_id: str, table: Mapping[str, Any]) -> Architecture:
     name = table.get("architecture")
     if not isinstance(name, str) or name not in ARCHITECTURES:
         known = ", ".join(sorted(ARCHITECTURES))
-        raise Refused(f"{POLICY}: architecture must be one of {known}, got {shown(name)}")
+        raise Refused(f"{POLICY}: architecture must be one of {known}, got {shown_ascii(name)}")
     kind = ARCHITECTURES[name]
     return kind(env_id, accepted(kind.table, dict(table), POLICY))
 
@@ -86,7 +86,7 @@ class ControllerTable(PolicyTable):
     numbers: dict[str, Any] = Field(default={})
 
 
-class Controller(Architecture):
+class ControllerPolicy(Architecture):
     """A controller of `lag_envs.controllers`, made for the undisturbed environment.
 
     In the table: `name`, one of the task's controllers, and optionally the table ``numbers`` of its numeric
@@ -102,7 +102,7 @@ class Controller(Architecture):
         self.task = TASKS[env_id]()
         known = controllers(self.task)
         if table.name not in known:
-            raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown(table.name)}")
+            raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown_ascii(table.name)}")
         found = known[table.name]
         self.build, self.plans = partial(build, self.task, table.name), found.plans
         self.module = found.place.partition(":")[0]
@@ -124,7 +124,7 @@ class Controller(Architecture):
                 warnings.simplefilter("ignore")
                 return self.build(**self.numbers)
         except Exception as error:  # nonsensical numbers may raise anything
-            reason = shown(f"{type(error).__name__}: {error}")
+            reason = shown_ascii(f"{type(error).__name__}: {error}")
             raise Refused(f"the controller cannot be made with these numbers: {reason}") from error
 
 
@@ -132,8 +132,8 @@ ARCHITECTURES: dict[str, type[Architecture]] = {
     "mlp": MLP,
     "gru": GRU,
     "linear": Linear,
-    "plan": Plan,
+    "plan": PlanArchitecture,
     "mpc": PlanAhead,
-    "table": Table,
-    "controller": Controller,
+    "table": GridArchitecture,
+    "controller": ControllerPolicy,
 }

@@ -10,7 +10,7 @@ import hashlib
 from typing import Any, NamedTuple
 
 from lag_envs.tasks import TASKS
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 
 #: Newest version of ``submission.toml``. Each version keeps the meaning of the older ones.
 SCHEMA = 2
@@ -80,7 +80,7 @@ def first_seed(digest: str, nonce: str, policy: int) -> int:
 # --- luck ---------------------------------------------------------------------------------------------------
 
 
-class Reference(NamedTuple):
+class ReferenceController(NamedTuple):
     """A quick controller that plays a verification's episodes too, see `ranking.corrected`.
 
     Parameters
@@ -99,10 +99,10 @@ class Reference(NamedTuple):
     episodes: int
 
 
-def reference(env_id: str) -> Reference | None:
+def reference(env_id: str) -> ReferenceController | None:
     """Return an environment's reference; None if its episodes differ little, or nobody measured it."""
-    name, found = TASKS[env_id].reference, measured(env_id).get("reference")
-    return Reference(name, **found) if name and found else None
+    name, found = TASKS[env_id].reference, measured_entry(env_id).get("reference")
+    return ReferenceController(name, **found) if name and found else None
 
 
 def boards() -> list[str]:

@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 
 
 class Reference(Protocol):
-    """The mean return of the controller that plays everybody's episodes, and its standard error."""
+    """The mean return of the controller that plays the same episodes, and its standard error."""
 
     @property
     def mean(self) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import Strict, checked, plain
+from lag_envs.leaderboard.fields import Strict, ascii_text, checked
 from lag_envs.leaderboard.log import EnvId, Hash, Number, Text, load_json
 
 #: Largest result [bytes], packed and unpacked.
@@ -54,7 +54,7 @@ class Replay(Strict):
         return self
 
 
-class Curve(Strict):
+class ClaimedCurve(Strict):
     """A learning curve."""
 
     seed: Count
@@ -63,7 +63,7 @@ class Curve(Strict):
 
 
 class Claimed(Strict):
-    """A submission's statements about itself, which nobody verified."""
+    """A submission's unverified statements about itself."""
 
     code: Text | None
     license: Text
@@ -71,10 +71,10 @@ class Claimed(Strict):
     env_steps: Number | None
     seconds: Number | None
     hardware: Text | None
-    curves: list[Curve]
+    curves: list[ClaimedCurve]
 
 
-class Result(Strict):
+class VerificationResult(Strict):
     """What `verify` returns; on a board with `claimed` and `replays`."""
 
     protocol: Count | None = None  # only in old results; otherwise the log has it
@@ -104,10 +104,10 @@ class Result(Strict):
         return self
 
 
-_RESULT: TypeAdapter[Result] = TypeAdapter(Result)
+_RESULT: TypeAdapter[VerificationResult] = TypeAdapter(VerificationResult)
 
 
-def check(result: Any) -> dict[str, Any]:
+def checked_result(result: Any) -> dict[str, Any]:
     """Return a valid result; raise a ValueError otherwise."""
     checked(_RESULT, result)
     return result
@@ -124,10 +124,10 @@ def unpacked(content: bytes) -> dict[str, Any]:
         raise ValueError(f"it cannot be unpacked: {type(error).__name__}: {error}") from None
     if len(text) > UNPACKED:
         raise ValueError(f"it unpacks to more than {UNPACKED:,} bytes")
-    return check(load_json(text))
+    return checked_result(load_json(text))
 
 
-class Axis(Strict):
+class ValueAxis(Strict):
     """An axis of a value function: a state's name, and evenly spaced nodes."""
 
     label: Text
@@ -136,10 +136,10 @@ class Axis(Strict):
     n: Annotated[int, Field(ge=2, le=1000)]
 
 
-class Value(Strict):
+class ValueFunction(Strict):
     """A coarse value function over two entries of the state."""
 
-    axes: Annotated[list[Axis], Field(min_length=2, max_length=2)]
+    axes: Annotated[list[ValueAxis], Field(min_length=2, max_length=2)]
     values: list[list[Number]]
 
     @model_validator(mode="after")
@@ -150,7 +150,7 @@ class Value(Strict):
         return self
 
 
-_VALUE: TypeAdapter[Value] = TypeAdapter(Value)
+_VALUE: TypeAdapter[ValueFunction] = TypeAdapter(ValueFunction)
 
 
 def checked_value(content: bytes) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def checked_value(content: bytes) -> dict[str, Any]:
 
 
 @cache
-def build() -> str:
+def code_digest() -> str:
     """Return the SHA-256 of this package's code: another build may give other bits."""
     root, total = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
@@ -173,7 +173,7 @@ def build() -> str:
 # --- two of the same ----------------------------------------------------------------------------------------
 
 
-class Comparison(NamedTuple):
+class VerificationComparison(NamedTuple):
     """How two verifications of the same submission differ.
 
     Parameters
@@ -194,9 +194,9 @@ class Comparison(NamedTuple):
     far: list[str]
 
 
-def compare(
+def compare_results(
     result: Mapping[str, Any], other: Mapping[str, Any], way: float, plans: bool = False
-) -> Comparison:
+) -> VerificationComparison:
     """Compare two verifications of the same submission with the same nonce and number of episodes.
 
     Parameters
@@ -236,7 +236,7 @@ def compare(
         raise ValueError("the results differ in their conditions")
     for name, means in conditions.items():
         if not _near(means, others[name], few * way):
-            far.append(f"the means under {plain(name)}")
+            far.append(f"the means under {ascii_text(name)}")
     same = all(a["trajectory"] == b["trajectory"] for a, b in pairs)
     same = same and all(result[name] == other[name] for name in ("robustness", "often"))
     builds = [
@@ -246,7 +246,7 @@ def compare(
     of_one = result.get("build") is not None and builds[0] == builds[1]
     if of_one and not same:
         far.append("the bits, though both are of the same build")
-    return Comparison(same, of_one, float(difference), far)
+    return VerificationComparison(same, of_one, float(difference), far)
 
 
 def apart(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lag_envs.errors import UserError
-from lag_envs.store import write
+from lag_envs.store import write_file
 
 FOLDER = Path(__file__).parent / "best"
 INDEX = "policies.json"
@@ -55,12 +55,12 @@ def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
 
 def load(env_id: str, folder: Path = FOLDER) -> Any:
     """Return an environment's policy, with the `predict` of Stable-Baselines3."""
-    from lag_envs.leaderboard.policies import Policy, architecture
+    from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
     from lag_envs.leaderboard.submission import read_arrays
 
     made = architecture(env_id, shipped(folder)[env_id].policy)
     file = folder / f"{env_id}.safetensors"
-    return Policy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
+    return SubmittedPolicy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
 
 
 # --- choosing them ------------------------------------------------------------------------------------------
@@ -77,7 +77,7 @@ class Candidate(NamedTuple):
     name: str
 
 
-def candidates(board: Any) -> list[Candidate]:
+def board_candidates(board: Any) -> list[Candidate]:
     """Return the verified policies of a board that have arrays."""
     from lag_envs.leaderboard.protocol import reference
     from lag_envs.leaderboard.ranking import corrected
@@ -99,7 +99,7 @@ def candidates(board: Any) -> list[Candidate]:
     return found
 
 
-def chosen(of: Iterable[Candidate], most: int = MOST) -> dict[str, Candidate]:
+def chosen_candidates(of: Iterable[Candidate], most: int = MOST) -> dict[str, Candidate]:
     """Return the best for each environment; if they are too large together, replace those that lose least.
 
     Examples
@@ -130,7 +130,7 @@ def ship(board: Any, folder: Path = FOLDER) -> dict[str, Shipped]:
 
     from lag_envs.tasks import TASKS
 
-    best, index = chosen(candidates(board)), {}
+    best, index = chosen_candidates(board_candidates(board)), {}
     if not best:
         raise UserError(f"{board.folder} has no verified policies; name the board's folder with --board")
     for left in folder.glob("*.safetensors"):
@@ -139,10 +139,12 @@ def ship(board: Any, folder: Path = FOLDER) -> dict[str, Shipped]:
         found = best[env_id]
         place = board.submission(found.submission)
         table = tomllib.loads((place / "submission.toml").read_text(encoding="utf-8"))["policy"]
-        write(folder / f"{env_id}.safetensors", (place / f"policy_{found.seed}.safetensors").read_bytes())
+        write_file(
+            folder / f"{env_id}.safetensors", (place / f"policy_{found.seed}.safetensors").read_bytes()
+        )
         index[env_id] = Shipped(found.name, round(found.score, 4), found.submission, found.seed, table)
     text = json.dumps({env_id: entry._asdict() for env_id, entry in index.items()}, indent=1)
-    write(folder / INDEX, text + "\n")
+    write_file(folder / INDEX, text + "\n")
     return index
 
 

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs.leaderboard.board import Board, closed
 from lag_envs.leaderboard.files import read_plain
-from lag_envs.leaderboard.log import REMEDY, BoardError, Entry, State
+from lag_envs.leaderboard.log import REMEDY, BoardEntry, BoardError, BoardState
 from lag_envs.leaderboard.pending import shown_episodes
 from lag_envs.leaderboard.results import PACKED, checked_value
 from lag_envs.scores import KnownReturns, known_returns, normalised
 from lag_envs.tasks import TASKS
 
 if TYPE_CHECKING:
-    from lag_envs.leaderboard.combined import Agent, Result
+    from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
 
 
 def page_data(board: Board) -> dict[str, Any]:
-    """Return `board_data` and what only the page needs: agents that run there, drives by hand."""
+    """Return `board_data` and what only the page needs: agents that run there, and human drives."""
     from lag_envs.leaderboard.drives import best_drives
     from lag_envs.leaderboard.site.driving import agent
     from lag_envs.leaderboard.submission import load
@@ -59,7 +59,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     BoardError
         If something on the board is not as it was logged, see `audit.sound`.
     """
-    from lag_envs.evaluation.statistics import rounded
+    from lag_envs.evaluation.statistics import rounded_data
     from lag_envs.leaderboard.audit import sound
     from lag_envs.leaderboard.combined import combined
 
@@ -67,7 +67,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     current = state.number or 1
     keys = {(env_id, current): None for env_id in TASKS if not closed(env_id, current, current)}
     frozen = sorted({(e.env, e.protocol) for e in state.all} - set(keys))
-    found: dict[str, dict[Agent, Result]] = {}
+    found: dict[str, dict[AgentIdentity, AgentScore]] = {}
     return {
         "protocol": current,
         "made": made or datetime.now(UTC).date().isoformat(),
@@ -75,23 +75,23 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
             *(_environment(board, state, results, *key, found.setdefault(key[0], {})) for key in keys),
             *(_environment(board, state, results, *key, {}) for key in frozen),
         ],
-        "combined": rounded(combined(found)),
+        "combined": rounded_data(combined(found)),
     }
 
 
 def _environment(
     board: Board,
-    state: State,
+    state: BoardState,
     results: Mapping[tuple[int, str], dict[str, Any]],
     env_id: str,
     number: int,
-    reached: dict[Agent, Result],
+    reached: dict[AgentIdentity, AgentScore],
 ) -> dict[str, Any]:
     """Return a board, and note the results of its ranked agents."""
-    from lag_envs.evaluation.statistics import ends, iqm, rounded
+    from lag_envs.evaluation.statistics import ends, iqm, rounded_data
     from lag_envs.leaderboard import ranking
-    from lag_envs.leaderboard.combined import Agent, Result
-    from lag_envs.leaderboard.site.scenery import describe
+    from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
+    from lag_envs.leaderboard.site.scenery import scenery_data
 
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
     told = state.protocols.get(number)
@@ -134,8 +134,8 @@ def _environment(
             samples = iqm(drawn[id])
             row["interval"] = list(ends(samples))
             if place is not None:
-                agent = Agent(entry.name, tuple(entry.authors))
-                reached[agent] = Result(row["score"], samples, entry.kind)
+                agent = AgentIdentity(entry.name, tuple(entry.authors))
+                reached[agent] = AgentScore(row["score"], samples, entry.kind)
             middle, chosen = shown_episodes(result)
             verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
             row["replays"] = [
@@ -144,7 +144,7 @@ def _environment(
                 # Under protocol 1, the episodes of random actions were different ones.
                 if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
             ]
-            rows.append(rounded(row))
+            rows.append(rounded_data(row))
     return {
         "id": env_id,
         "protocol": number,
@@ -158,7 +158,7 @@ def _environment(
             for e in entries.values()
             if e.state != "verified"
         ],
-    } | describe(env_id)
+    } | scenery_data(env_id)
 
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
@@ -170,7 +170,7 @@ def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     return (known or dict.fromkeys(KnownReturns._fields)) | scale.model_dump()
 
 
-def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:
+def _looks_like(entry: BoardEntry, entries: Iterable[BoardEntry]) -> str:
     """Return another's earlier author or name that looks like this entry's; empty if there is none."""
     from lag_envs.leaderboard.names import lookalike
 

@@ -26,10 +26,18 @@ from pydantic import AfterValidator, Field, model_validator
 from lag_envs.errors import hint
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import Architecture
-from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, plain, shown
+from lag_envs.leaderboard.fields import (
+    Strict,
+    accepted,
+    ascii_text,
+    between,
+    length_between,
+    line,
+    shown_ascii,
+)
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.names import wordless
-from lag_envs.leaderboard.policies import Policy, architecture
+from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
 from lag_envs.leaderboard.protocol import Refused
 
 __all__ = ["About", "Refused", "Submission", "about", "digest_of", "load", "read_files", "write"]
@@ -90,7 +98,7 @@ class Submission(About):
         Where it was read.
     """
 
-    policies: tuple[tuple[int, Policy], ...]
+    policies: tuple[tuple[int, SubmittedPolicy], ...]
     folder: Path
 
 
@@ -98,8 +106,8 @@ class Submission(About):
 
 
 Seed = Annotated[int, between(0, MOST_SEED - 1)]
-Steps = Annotated[list[Annotated[float, between(0.0, 1e15)]], many(1, protocol.CURVE)]
-Returns = Annotated[list[Annotated[float, between(-1e9, 1e9)]], many(1, protocol.CURVE)]
+Steps = Annotated[list[Annotated[float, between(0.0, 1e15)]], length_between(1, protocol.CURVE)]
+Returns = Annotated[list[Annotated[float, between(-1e9, 1e9)]], length_between(1, protocol.CURVE)]
 
 
 def _named(name: str) -> str:
@@ -131,11 +139,11 @@ class Curve(Strict):
 class Training(Strict):
     """The table ``[training]``."""
 
-    seeds: Annotated[list[Seed], many(0, protocol.MOST_POLICIES)] = Field(default=[])
+    seeds: Annotated[list[Seed], length_between(0, protocol.MOST_POLICIES)] = Field(default=[])
     env_steps: Annotated[int, between(0, 10**15)]
     seconds: Annotated[float, between(0.0, 1e12)]
     hardware: Annotated[str, line(200)]
-    curves: Annotated[list[Curve], many(0, protocol.MOST_POLICIES)] = Field(default=[])
+    curves: Annotated[list[Curve], length_between(0, protocol.MOST_POLICIES)] = Field(default=[])
 
 
 class Toml(Strict):
@@ -146,7 +154,7 @@ class Toml(Strict):
     stated: Annotated[int, between(1, 10**6)] = Field(default=1, alias="protocol")
     env: Annotated[str, AfterValidator(_on_a_board)]
     name: Annotated[str, line(60), Field(pattern="[A-Za-z0-9]")]
-    authors: Annotated[list[Annotated[str, line(80), AfterValidator(_named)]], many(1, 20)]
+    authors: Annotated[list[Annotated[str, line(80), AfterValidator(_named)]], length_between(1, 20)]
     license: Annotated[str, line(60), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+() -]*$")]
     code: Annotated[str, line(200), Field(pattern=r"^(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?$")] = ""
     description: Annotated[str, line(500)] = ""
@@ -176,11 +184,11 @@ def load(folder: Path | str) -> Submission:
     files = read_files(folder)
     told = about(files)
     made = told.architecture
-    policies: list[tuple[int, Policy]] = []
+    policies: list[tuple[int, SubmittedPolicy]] = []
     for seed in told.seeds:
         name = f"policy_{seed}.safetensors"
         arrays = read_arrays(name, files[name], made) if made.arrays else {}
-        policy = Policy(made, arrays)
+        policy = SubmittedPolicy(made, arrays)
         try:
             policy.agent()
         except Refused as error:
@@ -238,15 +246,15 @@ def read_files(folder: Path) -> dict[str, bytes]:
     """
     try:
         if not stat.S_ISDIR(os.lstat(folder).st_mode):
-            raise Refused(f"{shown(str(folder))} is not a folder (links are not followed)")
+            raise Refused(f"{shown_ascii(str(folder))} is not a folder (links are not followed)")
         with os.scandir(folder) as entries:
             names = [entry.name for entry, _ in zip(entries, range(protocol.MOST_POLICIES + 2), strict=False)]
     except OSError as error:
-        raise Refused(f"{shown(str(folder))} cannot be read: {error.strerror}") from error
+        raise Refused(f"{shown_ascii(str(folder))} cannot be read: {error.strerror}") from error
     for name in sorted(names):
         if name != TOML and not POLICY.fullmatch(name):
             raise Refused(
-                f"unknown file {shown(name)}: only {TOML} and policy_<seed>.safetensors belong here"
+                f"unknown file {shown_ascii(name)}: only {TOML} and policy_<seed>.safetensors belong here"
             )
     if len(names) > protocol.MOST_POLICIES + 1:
         raise Refused(f"there are more than {protocol.MOST_POLICIES} policies")
@@ -298,7 +306,7 @@ def _parse(content: bytes) -> dict[str, Any]:
     except RecursionError as error:
         raise Refused(f"{TOML} is nested too deeply") from error
     except Exception as error:  # not only TOMLDecodeError: numbers of too many digits, dates
-        raise Refused(f"{TOML} is not valid TOML: {shown(str(error))}") from error
+        raise Refused(f"{TOML} is not valid TOML: {shown_ascii(str(error))}") from error
 
 
 def _training(told: Training, found: list[int]) -> dict[str, Any]:
@@ -321,14 +329,14 @@ def _kind(made: Architecture, trained: bool, stated: Any) -> str:
     if stated not in (None, kind):
         raise Refused(
             f'{TOML}: kind must be "{kind}" for this architecture {"with" if trained else "without"}'
-            f" [training], or left out, got {shown(stated)}"
+            f" [training], or left out, got {shown_ascii(stated)}"
         )
     if kind == "learned" and not trained:
         raise Refused(f"{TOML}: [training] is missing; learned policies need it")
     return kind
 
 
-def _check_different(policies: Sequence[tuple[int, Policy]]) -> None:
+def _check_different(policies: Sequence[tuple[int, SubmittedPolicy]]) -> None:
     """Refuse the same learned policy under two seeds."""
     first: dict[bytes, int] = {}
     for seed, policy in policies:
@@ -360,7 +368,7 @@ def read_arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDAr
         found = read(content)
     except (SafetensorError, ValueError, KeyError) as error:
         raise Refused(
-            f"{name} is not a safetensors file of the kind needed here: {plain(error)[:200]}"
+            f"{name} is not a safetensors file of the kind needed here: {ascii_text(error)[:200]}"
         ) from error
     _check_shapes(name, {key: array.shape for key, array in found.items()}, made)
     arrays = {}
@@ -390,9 +398,9 @@ def _check_header(content: bytes) -> None:
         raise ValueError(f"its header is not JSON ({error})") from error
     for key, entry in header.items() if isinstance(header, dict) else ():
         if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:
-            raise ValueError(f"{plain(key)} must have dtype, shape and data_offsets and nothing else")
+            raise ValueError(f"{ascii_text(key)} must have dtype, shape and data_offsets and nothing else")
         if entry["dtype"] not in ("F32", "F64"):
-            raise ValueError(f"{plain(key)} must be of F32 or F64, got {shown(entry['dtype'])}")
+            raise ValueError(f"{ascii_text(key)} must be of F32 or F64, got {shown_ascii(entry['dtype'])}")
 
 
 def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Architecture) -> None:
@@ -400,7 +408,7 @@ def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Archit
     if set(shapes) != set(made.arrays):
         odd = sorted(set(shapes) ^ set(made.arrays))[0]
         what = "is missing" if odd in made.arrays else "is not known"
-        raise Refused(f"{name}: array {shown(odd)} {what}; needed are {', '.join(made.arrays)}")
+        raise Refused(f"{name}: array {shown_ascii(odd)} {what}; needed are {', '.join(made.arrays)}")
     lengths: dict[str, int] = {}
     for key, needed in made.arrays.items():
         shape = shapes[key]

@@ -11,7 +11,7 @@ from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
 
 
-class Plan(Architecture):
+class PlanArchitecture(Architecture):
     """Action = planned action - gain · (state - planned state), with a gain for each step.
 
     After the plan, action = -hold · (state - rest). States are read from the observation; differences of an

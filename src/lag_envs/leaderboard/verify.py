@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from lag_envs import __version__
 from lag_envs.errors import UserError
 from lag_envs.evaluation.conditions import OFTEN, Condition, often, on_board
-from lag_envs.evaluation.rollout import Meter, Outcome, PolicyError, Rollout, play, record
-from lag_envs.evaluation.statistics import rounded
+from lag_envs.evaluation.rollout import Meter, Outcome, PolicyError, Rollout, play, record_rollout
+from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import plain
+from lag_envs.leaderboard.fields import ascii_text
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import load_json
-from lag_envs.leaderboard.results import UNPACKED, build, check, compare
+from lag_envs.leaderboard.results import UNPACKED, checked_result, code_digest, compare_results
 from lag_envs.leaderboard.submission import Refused, Submission, load
 from lag_envs.tasks import TASKS
 
@@ -118,7 +118,7 @@ def verify(
         "machine": _machine(),
         "versions": {"python": platform.python_version(), "lag-envs": __version__}
         | {name: version(name) for name in PACKAGES},
-        "build": build(),
+        "build": code_digest(),
     }
 
 
@@ -143,7 +143,7 @@ def _reference(env_id: str, seeds: Sequence[int]) -> dict[str, list[float]]:
     return {"reference": play(env_id, agent, seeds).tolist()}
 
 
-def replay(
+def record_again(
     submission: Submission, result: dict[str, Any], policy: int, chosen: Sequence[int]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Play some of the episodes of a verification again, and record them.
@@ -180,7 +180,7 @@ def replay(
     seeds = range(first, first + result["episodes"]) if hasattr(agent, "rng") else [first + i for i in chosen]
     rollout = Rollout(env, agent, seeds)
     outcome = Outcome(rollout)
-    played = record(rollout, outcome)
+    played = record_rollout(rollout, outcome)
     told = {"seed": training_seed, "returns": rollout.returns[rows].tolist()}
     told |= _reference(env, [first + i for i in chosen])
     for name, values in outcome.result().items():
@@ -191,9 +191,9 @@ def replay(
         return {
             "seed": training_seed, "reset_seed": first + i, "return": float(rollout.returns[row]),
             "dt": played.task.dt,
-            "states": rounded(played.states[: steps + 1, row].tolist()),
+            "states": rounded_data(played.states[: steps + 1, row].tolist()),
             "actions": _plain(played.actions[:steps, row]),
-            "rewards": rounded(played.rewards[:steps, row].tolist()),
+            "rewards": rounded_data(played.rewards[:steps, row].tolist()),
             "target": None if played.targets is None else _plain(played.targets[None, row])[0],
         }  # fmt: skip
 
@@ -202,7 +202,7 @@ def replay(
 
 def _plain(values: Array) -> list[Any]:
     """Return rows in JSON types; a row of one number as that number."""
-    return rounded((values[:, 0] if values.shape[1:] == (1,) else values).tolist())
+    return rounded_data((values[:, 0] if values.shape[1:] == (1,) else values).tolist())
 
 
 # --- the command --------------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ def run_verify(args: argparse.Namespace) -> int:
         if isinstance(result, Exception):
             raise result
         results.append({"folder": str(folder)} | result)
-        print("\n".join(table(results[-1])), flush=True)
+        print("\n".join(result_lines(results[-1])), flush=True)
         if before is not None and "refused" not in result:
             plans = load(folder).architecture.plans
             far |= _report(result, before.get(result["digest"]), args.against, plans)
@@ -271,7 +271,7 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
         if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
             raise ValueError("it is not a list of results")
         told = ({key: value for key, value in r.items() if key != "folder"} for r in found)
-        return {r["digest"]: check(r) for r in told if "refused" not in r}
+        return {r["digest"]: checked_result(r) for r in told if "refused" not in r}
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"--against: {file} cannot be read: {error}") from error
 
@@ -286,7 +286,7 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
     known = known_returns(result["env"])
     assert known is not None
     try:
-        found = compare(result, other, known.best - known.random, plans)
+        found = compare_results(result, other, known.best - known.random, plans)
     except ValueError as error:
         raise UserError(f"--against: {file}: {error}") from error
     if found.same:
@@ -318,7 +318,7 @@ def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
     from tqdm import tqdm
 
     with tqdm(
-        desc=plain(folder.name), unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5
+        desc=ascii_text(folder.name), unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5
     ) as bar:
 
         def show(done: int, work: int) -> None:
@@ -328,16 +328,16 @@ def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
         return verify_folder(folder, nonce, episodes, show)
 
 
-def table(result: dict[str, Any]) -> list[str]:
+def result_lines(result: dict[str, Any]) -> list[str]:
     """Return a result as lines of text."""
     from lag_envs.leaderboard.ranking import corrected, policy_error
     from lag_envs.scores import score
 
     if "refused" in result:
-        return [f"{plain(result['folder'])}: refused: {result['refused']}"]
-    env = result["env"]
+        return [f"{ascii_text(result['folder'])}: refused: {result['refused']}"]
+    env, folder = result["env"], ascii_text(result["folder"])
     lines = [
-        f"{plain(result['folder'])}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
+        f"{folder}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
         f"  {'seed':>6}  {'return':>12}  {'±':>7}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
     ]
     for policy in result["policies"]:

@@ -5,7 +5,7 @@ coefficients, so that equal terms are merged and terms that cancel leave nothing
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
 an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Besides the rules
 of sums and products there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that agree in
-everything else (`collect`).
+everything else (`apply_identities`).
 
 Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
 same bits in every process.
@@ -124,7 +124,7 @@ class Expr:
         return hash(self.text)
 
     def same(self, other: Expr) -> bool:
-        """Tell whether two expressions have the same terms."""
+        """Return whether two expressions have the same terms."""
         return self.terms == other.terms
 
     @property
@@ -211,7 +211,7 @@ class Expr:
         whole = isinstance(exponent, numbers.Real) and float(exponent).is_integer()
         if not whole or modulo is not None:
             if isinstance(exponent, numbers.Real) and float(exponent) in (0.5, -0.5):
-                root = function("sqrt", self)
+                root = function_of("sqrt", self)
                 return root if float(exponent) > 0 else root.reciprocal()
             raise FormulaError(
                 f"a recorded number is raised to the power {exponent!r}; only whole numbers and ±0.5 can be "
@@ -340,7 +340,7 @@ def _closed(expr: Expr) -> Expr:
 FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
 
 
-def function(name: str, argument: Any) -> Expr:
+def function_of(name: str, argument: Any) -> Expr:
     """Return a function of an expression."""
     argument = Expr.of(argument)
     if name == "sqrt":
@@ -353,7 +353,7 @@ def function(name: str, argument: Any) -> Expr:
             raise FormulaError(f"a formula takes xp.{name} of {number:g}") from error
     if name in ("sin", "cos", "atan", "tanh") and _leads_negative(argument):
         # One atom for an angle and its opposite.
-        opposite = function(name, -argument)
+        opposite = function_of(name, -argument)
         return opposite if name == "cos" else -opposite
     return Expr({((Atom("function", name, argument), 1),): 1})
 
@@ -398,42 +398,42 @@ def _leads_negative(expr: Expr) -> bool:
     return expr.sorted_terms()[0][1] < 0
 
 
-class Functions:
+class RecordedFunctions:
     """The namespace ``xp`` of a formula that is recorded."""
 
     pi = math.pi
 
     def sin(self, x: Any) -> Any:
         """Return the sine."""
-        return function("sin", x)
+        return function_of("sin", x)
 
     def cos(self, x: Any) -> Any:
         """Return the cosine."""
-        return function("cos", x)
+        return function_of("cos", x)
 
     def tan(self, x: Any) -> Any:
         """Return the tangent."""
-        return function("sin", x) / function("cos", x)
+        return function_of("sin", x) / function_of("cos", x)
 
     def exp(self, x: Any) -> Any:
         """Return the exponential."""
-        return function("exp", x)
+        return function_of("exp", x)
 
     def log(self, x: Any) -> Any:
         """Return the natural logarithm."""
-        return function("log", x)
+        return function_of("log", x)
 
     def sqrt(self, x: Any) -> Any:
         """Return the square root."""
-        return function("sqrt", x)
+        return function_of("sqrt", x)
 
     def atan(self, x: Any) -> Any:
         """Return the inverse tangent."""
-        return function("atan", x)
+        return function_of("atan", x)
 
     def tanh(self, x: Any) -> Any:
         """Return the hyperbolic tangent."""
-        return function("tanh", x)
+        return function_of("tanh", x)
 
     arctan = atan
 
@@ -456,9 +456,9 @@ def _slope(atom: Atom) -> Expr:
     x = atom.argument
     assert x is not None
     if atom.function == "sin":
-        return function("cos", x)
+        return function_of("cos", x)
     if atom.function == "cos":
-        return -function("sin", x)
+        return -function_of("sin", x)
     if atom.function == "exp":
         return Expr.of(atom)
     if atom.function == "log":
@@ -509,13 +509,13 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
                 factor = Expr.of(atom)
             else:
                 inner = substitute(atom.argument, values)
-                factor = inner if atom.function == "sum" else function(atom.function, inner)
+                factor = inner if atom.function == "sum" else function_of(atom.function, inner)
             product = product * factor**n
         total = total + product
     return total
 
 
-def collect(expr: Expr) -> Expr:
+def apply_identities(expr: Expr) -> Expr:
     """Apply cos² + sin² = 1, and the addition formulas of cosine and sine, to terms that match.
 
     Two terms match if they agree in all but a pair of factors and their coefficients have the same size. So
@@ -565,12 +565,12 @@ def _of_sum(a: Atom, b: Atom, alike: bool) -> Expr:
     x, y = a.argument, b.argument
     assert x is not None and y is not None
     if a.function == b.function == "cos":
-        return function("cos", x - y if alike else x + y)
+        return function_of("cos", x - y if alike else x + y)
     if a.function == b.function == "sin":
-        return function("cos", x - y) if alike else -function("cos", x + y)
+        return function_of("cos", x - y) if alike else -function_of("cos", x + y)
     if a.function == "cos":  # sin y cos x ± sin x cos y
-        return function("sin", y + x if alike else y - x)
-    return function("sin", x + y if alike else x - y)
+        return function_of("sin", y + x if alike else y - x)
+    return function_of("sin", x + y if alike else x - y)
 
 
 def _twin(atom: Atom) -> Atom:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative
 
 
 def place(name: str) -> Atom:
@@ -46,7 +46,7 @@ class Energies:
 
 
 @dataclasses.dataclass(frozen=True)
-class Equations:
+class EquationsOfMotion:
     """The equations of motion ``Σ_j mass[i, j] a_j = force[i]``, and what goes with them.
 
     Attributes
@@ -81,7 +81,7 @@ def _degree(monomial: Sequence[tuple[Atom, int]]) -> int:
     return sum(n for atom, n in monomial if atom.kind == "velocity")
 
 
-def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -> Equations:
+def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -> EquationsOfMotion:
     """Derive Lagrange's equations.
 
     Parameters
@@ -97,14 +97,14 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
         If the kinetic energy is not a polynomial of degree two in the velocities, or lacks a coordinate.
     """
     names = (*free, *prescribed)
-    kinetic = collect(energies.kinetic)
+    kinetic = apply_identities(energies.kinetic)
     _check_velocities(kinetic)
     _check_no_velocity("potential", energies.potential)
     momenta = [derivative(kinetic, velocity(name)) for name in names]
     mass: dict[tuple[int, int], Expr] = {}
     for i in range(len(names)):
         for j in range(i, len(names)):
-            entry = collect(derivative(momenta[i], velocity(names[j])))
+            entry = apply_identities(derivative(momenta[i], velocity(names[j])))
             if entry.terms:
                 mass[i, j] = entry
     for i, name in enumerate(free):
@@ -122,9 +122,9 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
             convective = convective + derivative(momentum, place(other)) * velocity(other)
         total = derivative(kinetic, q) - convective - derivative(energies.potential, q)
         total = total - derivative(energies.dissipation, v) + energies.applied.get(name, Expr({}))
-        force.append(collect(total))
+        force.append(apply_identities(total))
     collected = dataclasses.replace(energies, kinetic=kinetic)
-    return Equations(tuple(names), len(free), mass, linear, tuple(force), collected)
+    return EquationsOfMotion(tuple(names), len(free), mass, linear, tuple(force), collected)
 
 
 def _check_velocities(kinetic: Expr) -> None:

@@ -1,6 +1,6 @@
 """Numbers of a derived motion: accelerations, forces, powers and derivatives, for one state or many.
 
-The same code runs on arrays and on `Dual` numbers, which carry derivatives along.
+The same code runs on arrays and on `DualArray` numbers, which carry derivatives along.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ def exactly(parameters: Mapping[str, float]) -> dict[Atom, Any]:
 
 
 def _bare(x: Any) -> Any:
-    return x.value if isinstance(x, Lanes) else x
+    return x.value if isinstance(x, LaneArray) else x
 
 
 def _binary(f: Any) -> tuple[Any, Any]:
-    return lambda a, b: Lanes(f(_bare(a), _bare(b))), lambda a, b: Lanes(f(_bare(b), _bare(a)))
+    return lambda a, b: LaneArray(f(_bare(a), _bare(b))), lambda a, b: LaneArray(f(_bare(b), _bare(a)))
 
 
 def _on_lanes(f: Any) -> Any:
-    return staticmethod(lambda x: Lanes(f(_bare(x))))
+    return staticmethod(lambda x: LaneArray(f(_bare(x))))
 
 
-class Lanes:
+class LaneArray:
     """An array that a formula takes for a single number, even if it builds arrays of its numbers."""
 
     __slots__ = ("value",)
@@ -78,15 +78,15 @@ class Lanes:
     __truediv__, __rtruediv__ = _binary(operator.truediv)
     __pow__, __rpow__ = _binary(operator.pow)
 
-    def __neg__(self) -> Lanes:
-        return Lanes(-self.value)
+    def __neg__(self) -> LaneArray:
+        return LaneArray(-self.value)
 
-    def __pos__(self) -> Lanes:
+    def __pos__(self) -> LaneArray:
         return self
 
 
-class OfLanes:
-    """The functions of `Numeric` on `Lanes`."""
+class LaneArrayFunctions:
+    """The functions of `Numeric` on `LaneArray`."""
 
     pi = math.pi
     sin, cos, tan = (_on_lanes(f) for f in (np.sin, np.cos, np.tan))
@@ -94,7 +94,7 @@ class OfLanes:
     atan = arctan = _on_lanes(np.arctan)
 
 
-class Dual:
+class DualArray:
     """A number with its derivatives: ``value`` of shape (...), ``slope`` of shape (..., n)."""
 
     __slots__ = ("slope", "value")
@@ -103,54 +103,54 @@ class Dual:
     def __init__(self, value: Any, slope: Any) -> None:
         self.value, self.slope = np.asarray(value), slope
 
-    def __add__(self, other: Any) -> Dual:
-        if isinstance(other, Dual):
-            return Dual(self.value + other.value, self.slope + other.slope)
-        return Dual(self.value + other, self.slope)
+    def __add__(self, other: Any) -> DualArray:
+        if isinstance(other, DualArray):
+            return DualArray(self.value + other.value, self.slope + other.slope)
+        return DualArray(self.value + other, self.slope)
 
     __radd__ = __add__
 
-    def __mul__(self, other: Any) -> Dual:
-        if isinstance(other, Dual):
+    def __mul__(self, other: Any) -> DualArray:
+        if isinstance(other, DualArray):
             slope = self.value[..., None] * other.slope + other.value[..., None] * self.slope
-            return Dual(self.value * other.value, slope)
-        return Dual(self.value * other, np.asarray(other)[..., None] * self.slope)
+            return DualArray(self.value * other.value, slope)
+        return DualArray(self.value * other, np.asarray(other)[..., None] * self.slope)
 
     __rmul__ = __mul__
 
-    def __sub__(self, other: Any) -> Dual:
+    def __sub__(self, other: Any) -> DualArray:
         return self + -1.0 * other
 
-    def __rsub__(self, other: Any) -> Dual:
+    def __rsub__(self, other: Any) -> DualArray:
         return -1.0 * self + other
 
-    def __truediv__(self, other: Any) -> Dual:
+    def __truediv__(self, other: Any) -> DualArray:
         value, divisor = _parts(self), _parts(other)
         quotient = value[0] / divisor[0]
-        return Dual(quotient, (value[1] - quotient[..., None] * divisor[1]) / divisor[0][..., None])
+        return DualArray(quotient, (value[1] - quotient[..., None] * divisor[1]) / divisor[0][..., None])
 
-    def __rtruediv__(self, other: Any) -> Dual:
+    def __rtruediv__(self, other: Any) -> DualArray:
         quotient = other / self.value
-        return Dual(quotient, -(quotient / self.value)[..., None] * self.slope)
+        return DualArray(quotient, -(quotient / self.value)[..., None] * self.slope)
 
 
 def _parts(x: Any) -> tuple[Any, Any]:
     """Return value and slope of any number."""
-    return (x.value, x.slope) if isinstance(x, Dual) else (np.asarray(x, dtype=np.float64), 0.0)
+    return (x.value, x.slope) if isinstance(x, DualArray) else (np.asarray(x, dtype=np.float64), 0.0)
 
 
 def _carried(function: Any, slope: Any) -> Any:
     def of(x: Any) -> Any:
-        if not isinstance(x, Dual):
+        if not isinstance(x, DualArray):
             return function(x)
         y = function(x.value)
-        return Dual(y, slope(x.value, y)[..., None] * x.slope)
+        return DualArray(y, slope(x.value, y)[..., None] * x.slope)
 
     return staticmethod(of)
 
 
-class Carrying:
-    """The functions of `Numeric` on `Dual` numbers."""
+class DualArrayFunctions:
+    """The functions of `Numeric` on `DualArray` numbers."""
 
     sin = _carried(np.sin, lambda x, y: np.cos(x))
     cos = _carried(np.cos, lambda x, y: -np.sin(x))
@@ -177,7 +177,7 @@ def eliminated(matrix: Sequence[Sequence], right: Sequence) -> list:
     return b
 
 
-class Point:
+class MotionPoint:
     """A motion at given states under given controls.
 
     Attributes
@@ -205,7 +205,7 @@ class Point:
         parameters : mapping from Atom to float
             The parameters' values.
         state, controls : sequence of numbers
-            By entry: numbers, arrays that broadcast, or `Dual` numbers.
+            By entry: numbers, arrays that broadcast, or `DualArray` numbers.
         xp : namespace
             Functions for these numbers.
         """

@@ -27,7 +27,7 @@ class Prescribed(NamedTuple):
     control: str | None
 
 
-class Entry(NamedTuple):
+class StateEntry(NamedTuple):
     """An entry of the state.
 
     ``kind`` is ``"place"``, ``"velocity"``, or ``"momentum"`` for w = v + M⁻¹ Σ G ṡ of a free coordinate.
@@ -40,7 +40,7 @@ class Entry(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class SceneLayout:
     """The names of a scene, in order, for one mode and one set of structural fields.
 
     Attributes
@@ -68,7 +68,7 @@ class Layout:
     controls: tuple[str, ...]
     control_units: tuple[str, ...]
     absent: tuple[str, ...]
-    state: tuple[Entry, ...]
+    state: tuple[StateEntry, ...]
     left_out: tuple[str, ...]
     reactions: tuple[tuple[str, str], ...]
     ratios: tuple[tuple[str, str, str], ...]
@@ -128,7 +128,7 @@ def make_layout(
     left_out: Any,
     reactions: Any,
     ratios: Any,
-) -> Layout:
+) -> SceneLayout:
     """Return the layout from a class's declarations, or raise a FormulaError.
 
     Parameters
@@ -163,7 +163,7 @@ def make_layout(
         twice = next(e.name for e in kept if sum(e.name == other.name for other in kept) > 1)
         raise FormulaError(f"{of}: two entries of the state are named {twice!r}; rename a coordinate")
     forces = _reactions(of, reactions, moved)
-    return Layout(
+    return SceneLayout(
         free=tuple(free),
         prescribed=held,
         controls=tuple(driven),
@@ -206,21 +206,21 @@ def _held(of: str, name: str, driven: Mapping[str, str]) -> Prescribed:
     return Prescribed(name, found[0][1], found[0][0]) if found else Prescribed(name, "rest", None)
 
 
-def _full_state(free: dict, moved: dict, held: Sequence[Prescribed]) -> list[Entry]:
+def _full_state(free: dict, moved: dict, held: Sequence[Prescribed]) -> list[StateEntry]:
     entries = []
     for name, level, _ in held:
         if level in ("acceleration", "rate"):
-            entries.append(Entry(name, "place", name, moved[name]))
+            entries.append(StateEntry(name, "place", name, moved[name]))
         if level == "acceleration":
-            entries.append(Entry(f"{name}_dot", "velocity", name, rate_unit(moved[name])))
+            entries.append(StateEntry(f"{name}_dot", "velocity", name, rate_unit(moved[name])))
     jumps = any(p.level == "rate" for p in held)
     for name, unit in free.items():
-        entries.append(Entry(name, "place", name, unit))
+        entries.append(StateEntry(name, "place", name, unit))
         if jumps:
             carried = "w" if len(free) == 1 else f"w_{name}"
-            entries.append(Entry(carried, "momentum", name, rate_unit(unit)))
+            entries.append(StateEntry(carried, "momentum", name, rate_unit(unit)))
         else:
-            entries.append(Entry(f"{name}_dot", "velocity", name, rate_unit(unit)))
+            entries.append(StateEntry(f"{name}_dot", "velocity", name, rate_unit(unit)))
     return entries
 
 
@@ -229,7 +229,7 @@ def rate_unit(unit: str) -> str:
     return f"{unit or '1'}/s"
 
 
-def _check_left_out(of: str, omitted: Sequence[str], full: Sequence[Entry], free: dict) -> None:
+def _check_left_out(of: str, omitted: Sequence[str], full: Sequence[StateEntry], free: dict) -> None:
     by_name = {entry.name: entry for entry in full}
     for name in omitted:
         if name not in by_name:

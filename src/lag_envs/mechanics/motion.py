@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import Any
 
 from lag_envs.mechanics import recording
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative, substitute
-from lag_envs.mechanics.equations import Energies, Equations, derive, place, velocity
-from lag_envs.mechanics.layout import Layout, Prescribed
-from lag_envs.mechanics.recording import Record, control, parameter
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative, substitute
+from lag_envs.mechanics.equations import Energies, EquationsOfMotion, derive, place, velocity
+from lag_envs.mechanics.layout import Prescribed, SceneLayout
+from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Mechanics:
         The terms of other parameters that are 0 are left out when code is made.
     """
 
-    layout: Layout
+    layout: SceneLayout
     record: Record
     mass: Mapping[tuple[int, int], Expr]
     force: tuple[Expr, ...]
@@ -112,7 +112,7 @@ class Mechanics:
     def gyroscopic(self) -> tuple[Expr, Expr] | None:
         """T₁ and T₀, the parts of T of degree one and zero in the velocities, or None."""
         parts: list[dict] = [{}, {}]
-        for monomial, c in collect(self.record.energies.kinetic).terms.items():
+        for monomial, c in apply_identities(self.record.energies.kinetic).terms.items():
             degree = sum(n for atom, n in monomial if atom.kind == "velocity")
             if degree < 2:
                 parts[1 - degree][monomial] = c
@@ -131,11 +131,11 @@ class Mechanics:
         return bare
 
     @cached_property
-    def full(self) -> Equations:
+    def full(self) -> EquationsOfMotion:
         """Lagrange's equations of all coordinates, with resting ones put in after the derivation.
 
-        The accelerations of the prescribed coordinates are not put in: see `Equations`. The force that moves
-        or holds coordinate m is ``Σ_j entry(m, j) a_j - force[m]``.
+        The accelerations of the prescribed coordinates are not put in: see `EquationsOfMotion`. The force
+        that moves or holds coordinate m is ``Σ_j entry(m, j) a_j - force[m]``.
         """
         moving = [p.name for p in self.layout.prescribed]
         found = derive(self.layout.free, moving, self.record.energies)
@@ -148,7 +148,7 @@ class Mechanics:
             substitute(e.dissipation, held),
             {name: substitute(value, held) for name, value in e.applied.items()},
         )
-        return Equations(
+        return EquationsOfMotion(
             found.coordinates,
             found.free,
             {ij: entry for ij, entry in mass.items() if entry.terms},
@@ -158,7 +158,7 @@ class Mechanics:
         )
 
 
-def _held(layout: Layout, record: Record) -> dict[Atom, Expr]:
+def _held(layout: SceneLayout, record: Record) -> dict[Atom, Expr]:
     """Return the known places and velocities of the prescribed coordinates under held controls."""
     values: dict[Atom, Expr] = {}
     for name, level, by in layout.prescribed:
@@ -173,7 +173,7 @@ def _held(layout: Layout, record: Record) -> dict[Atom, Expr]:
     return values
 
 
-def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection[str] = ()) -> Mechanics:
+def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Collection[str] = ()) -> Mechanics:
     """Derive the equations of motion from the results of a scene's formulas.
 
     Parameters
@@ -195,7 +195,7 @@ def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection
     of = type(scene).__name__
     zero = {
         parameter(name): Expr.of(0)
-        for name in scene._numbers()
+        for name in parameter_names(scene)
         if getattr(scene, name) == 0.0
         and name not in varying
         and any(_is_hard(e, name) for e in found.exprs())
@@ -230,7 +230,7 @@ def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection
 
 
 def _is_hard(expr: Expr, name: str) -> bool:
-    """Tell whether a parameter occurs in a denominator or in a function."""
+    """Return whether a parameter occurs in a denominator or in a function."""
     return any(
         n < 0 and atom.name == name if atom.argument is None else parameter(name) in atom.argument.symbols()
         for monomial in expr.terms
@@ -238,7 +238,7 @@ def _is_hard(expr: Expr, name: str) -> bool:
     )
 
 
-def _check_left_out(of: str, layout: Layout, mass: Mapping, force: list[Expr]) -> None:
+def _check_left_out(of: str, layout: SceneLayout, mass: Mapping, force: list[Expr]) -> None:
     omitted = set(layout.left_out)
     for expr in (*mass.values(), *force):
         for symbol in sorted(expr.symbols(), key=lambda s: s.text):

@@ -13,9 +13,9 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, Functions, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, substitute
 from lag_envs.mechanics.equations import Energies, place, velocity
-from lag_envs.mechanics.layout import Layout
+from lag_envs.mechanics.layout import SceneLayout
 
 #: The formulas of a scene and their arguments after ``self``.
 ARGUMENTS: Mapping[str, tuple[str, ...]] = {
@@ -101,6 +101,17 @@ class Values:
         return f"<{self._what}s {', '.join(self._items)}>"
 
 
+def parameter_names(scene: Any) -> tuple[str, ...]:
+    """Return the names of a scene's parameters that have a value."""
+    fields = dataclasses.fields(scene)
+    return tuple(f.name for f in fields if "unit" in f.metadata and getattr(scene, f.name) is not None)
+
+
+def parameter_values(scene: Any) -> dict[str, Any]:
+    """Return a scene's parameters that have a value, by name."""
+    return {name: getattr(scene, name) for name in parameter_names(scene)}
+
+
 def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     """Return an object like the scene whose parameters are other numbers, or symbols.
 
@@ -111,7 +122,7 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     numbers : mapping
         A number for each parameter that is not None.
     """
-    other, given = object.__new__(type(scene)), scene._numbers()
+    other, given = object.__new__(type(scene)), parameter_names(scene)
     for field in dataclasses.fields(scene):
         value = numbers[field.name] if field.name in given else getattr(scene, field.name)
         object.__setattr__(other, field.name, value)
@@ -121,7 +132,7 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
 
 def symbolic_twin(scene: Any) -> Any:
     """Return an object like the scene whose parameters are recorded numbers."""
-    return twin(scene, {name: Expr.of(parameter(name)) for name in scene._numbers()})
+    return twin(scene, {name: Expr.of(parameter(name)) for name in parameter_names(scene)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +201,7 @@ def check_signature(scene: Any, name: str) -> None:
         )
 
 
-def single(value: Any, what: str = "") -> Expr:
+def single_expression(value: Any, what: str = "") -> Expr:
     """Return a formula's result as an expression, or raise a FormulaError."""
     if value is None:
         raise FormulaError(f"{what}returns None; end it with a return of a number")
@@ -204,7 +215,7 @@ def single(value: Any, what: str = "") -> Expr:
         raise FormulaError(f"{what}returns {value!r:.60}, which is not a real number") from None
 
 
-def record(scene: Any, layout: Layout) -> Record:
+def record_scene(scene: Any, layout: SceneLayout) -> Record:
     """Run all formulas of a scene on symbols.
 
     Raises
@@ -221,7 +232,7 @@ def record(scene: Any, layout: Layout) -> Record:
         {name: Expr.of(control(name)) for name in layout.controls},
         {name: Expr.of(0) for name in layout.absent},
     )
-    xp = Functions()
+    xp = RecordedFunctions()
     given = {"q": q, "v": v, "u": u, "xp": xp}
 
     def run(name: str) -> Any:
@@ -231,7 +242,7 @@ def record(scene: Any, layout: Layout) -> Record:
     parts = {}
     for name in ("kinetic", "potential", "dissipation"):
         with formula(scene, name):
-            parts[name] = single(run(name))
+            parts[name] = single_expression(run(name))
     with formula(scene, "applied"):
         applied = _by_name(run("applied"), names, "coordinate")
     with formula(scene, "rests"):
@@ -246,9 +257,9 @@ def record(scene: Any, layout: Layout) -> Record:
     return found
 
 
-def check_again(scene: Any, layout: Layout, found: Record) -> None:
+def check_again(scene: Any, layout: SceneLayout, found: Record) -> None:
     """Raise a FormulaError if a formula gives another result when it is run again."""
-    again = record(scene, layout).exprs()
+    again = record_scene(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
         raise FormulaError(
             f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend on "
@@ -266,7 +277,7 @@ def _by_name(values: Any, names: Sequence[str], what: str) -> dict[str, Expr]:
     for name in values:
         if name not in names:
             raise FormulaError(f"there is no {what} {name!r}, only {', '.join(names) or 'none at all'}")
-    return {name: single(values[name], f"for {name!r} it ") for name in names if name in values}
+    return {name: single_expression(values[name], f"for {name!r} it ") for name in names if name in values}
 
 
 def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
@@ -276,12 +287,12 @@ def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
     for body, pose in values.items():
         if not isinstance(pose, Sequence) or len(pose) != 3:
             raise FormulaError(f"the pose of {body!r} must be (x, y, angle), got {pose!r:.60}")
-        x, y, angle = (single(value, f"for {body!r} it ") for value in pose)
+        x, y, angle = (single_expression(value, f"for {body!r} it ") for value in pose)
         poses[body] = x, y, angle
     return poses
 
 
-def _check_controls(scene: Any, layout: Layout, found: Record) -> None:
+def _check_controls(scene: Any, layout: SceneLayout, found: Record) -> None:
     used = {s.name for e in found.exprs() for s in e.symbols() if s.kind == "control"}
     moving = {p.control for p in layout.prescribed}
     for name in layout.controls:

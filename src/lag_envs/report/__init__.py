@@ -10,7 +10,7 @@
 `reference`            exact end states from both, shared by a report's processes
 `integrators`          the integrators that people would otherwise use
 `equations`            problems in the form that rivals take: any equation, arrays of starts and parameters
-`rivals`, `peers`      ours, those integrators, and other libraries, all behind one interface
+`rivals`, `peers`      lag_envs, those integrators, and other libraries, all behind one interface
 `work_precision` ...   one module per section: its jobs and measurements; `..._results`: their presentation
 `points`               errors and times of methods, at their settings
 `verdicts`             who is faster at which error, from the points of `work_precision`

@@ -14,9 +14,9 @@ import numpy as np
 from mpmath import mp, mpf
 
 from lag_envs.report import reference
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.oracle import oracle_of
-from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Coefficients
@@ -32,21 +32,24 @@ MOST_SUBSTEPS = 100  # of the steps whose cost is measured, which run as plain P
 TOLERANCE = pendulum.TOLERANCE
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the section's jobs."""
     from lag_envs.tasks import TASKS
 
     parts, size = (2, 6) if quick else (6, 30)
     found = [
-        Job(SECTION, f"random drives {i + 1}", "bound:points", {"n": size, "seed": i}) for i in range(parts)
+        ReportJob(SECTION, f"random drives {i + 1}", "bound:bound_points", {"n": size, "seed": i})
+        for i in range(parts)
     ]
     found += [
-        Job(SECTION, f"substeps {i + 1}", "bound:cost", {"n": 12 if quick else 50, "seed": i})
+        ReportJob(
+            SECTION, f"substeps {i + 1}", "bound:substeps_needed", {"n": 12 if quick else 50, "seed": i}
+        )
         for i in range(1 if quick else 6)
     ]
     names = [name for name, task in TASKS.items() if task().certified_speed() is not None]
     return found + [
-        Job(SECTION, name, "bound:environment", {"id": name, "n": 6 if quick else 40})
+        ReportJob(SECTION, name, "bound:environment", {"id": name, "n": 6 if quick else 40})
         for name in (names[:1] if quick else names)
     ]
 
@@ -133,7 +136,7 @@ def majorant(x: float, h: float, order: int) -> tuple[float, float]:
     return tail / (order + 2), tail / h
 
 
-def points(n: int, seed: int) -> Iterator[Row]:
+def bound_points(n: int, seed: int) -> Iterator[Row]:
     """Yield bound and truncation error of one step, at every order, for n random drives."""
     for i in range(n):
         rng = np.random.default_rng([seed, i])
@@ -147,7 +150,7 @@ def points(n: int, seed: int) -> Iterator[Row]:
             yield row | {"theta_dot_bound": bounds[1], "theta_dot": actual[1]}
 
 
-def cost(n: int, seed: int) -> Iterator[Row]:
+def substeps_needed(n: int, seed: int) -> Iterator[Row]:
     """Yield, for steps of any length, the substeps that the bound requires and the fewest that suffice."""
     for i in range(n):
         rng = np.random.default_rng([9, seed, i])
@@ -156,7 +159,7 @@ def cost(n: int, seed: int) -> Iterator[Row]:
         while (chosen := pendulum.truncation_bound(omega, drive, h).substeps) > MOST_SUBSTEPS:
             h /= 2.0
         scene, control = driven(drive)
-        exact = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
+        exact = reference.exact_flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
         field = math.sqrt(math.hypot(drive.alpha, drive.beta))
         limits = (
             TOLERANCE * max(1.0, abs(theta), abs(omega) * h),
@@ -181,13 +184,13 @@ def _enough(
     exact: Sequence[mpf],
     limits: Sequence[float],
 ) -> bool:
-    """Tell whether n substeps, in float64, reach the required accuracy."""
+    """Return whether n substeps, in float64, reach the required accuracy."""
     h = dt / n
     y: Any = theta, omega, math.cos(theta), math.sin(theta)
     for i in range(n):
         theta, omega, c, s = y
         y = pendulum.step(theta, omega, c, s, drive._replace(delta=drive.delta + drive.ramp * (i * h)), h)
-    return all(abs(e) <= m for e, m in zip(reference.errors(y[:2], exact), limits, strict=True))
+    return all(abs(e) <= m for e, m in zip(reference.differences(y[:2], exact), limits, strict=True))
 
 
 def environment(id: str, n: int) -> Iterator[Row]:
@@ -258,7 +261,7 @@ COLOURS = {8: "#cc79a7", 12: "#56b4e9", 14: "#e69f00", 16: "#0072b2", 20: "#009e
 QUANTITIES = (("theta", "θ", "rad"), ("theta_dot", "θ'", "rad/s"))
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     kinds = {
         kind: [r for r in rows if r["kind"] == kind] for kind in ("point", "environment", "cost", "reach")
@@ -292,7 +295,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     pictures = []
     if kinds["point"]:
         pictures.append(
-            Picture(
+            ReportFigure(
                 "bound-scatter",
                 "Proved bound against actual truncation error, for random drives and steps such that x, "
                 "the size that the bound follows from, lies between 0.02 and 0.5. Every point must lie "
@@ -302,7 +305,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         )
     if counted:
         pictures.append(
-            Picture(
+            ReportFigure(
                 "bound-cost",
                 "What the bound costs: the substeps that it requires against the fewest that reach 1e-12, "
                 "order "
@@ -407,7 +410,7 @@ def _cost_text(rows: Sequence[Row]) -> str:
     return text + (f" In {missed} cases the number asked for was not enough." if missed else "")
 
 
-def _problem_table(problems: Sequence[Result]) -> Table | None:
+def _problem_table(problems: Sequence[JobResult]) -> Table | None:
     lines = [[p.name, p.problem] for p in problems]
     return Table("bound-problems", "Problems: not measured.", ["job", "problem"], lines) if lines else None
 

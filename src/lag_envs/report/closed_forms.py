@@ -90,7 +90,7 @@ def pendulum(oracle: Oracle, controls: Sequence[Any]) -> tuple[sympy.Rational, s
     return (alpha, beta) if turns else None
 
 
-def flow(
+def closed_form_flow(
     oracle: Oracle, coefficients: Sequence[Any], state: Sequence, controls: Sequence, dt: Any, digits: int
 ) -> list[mpf]:
     """Return the state after a time dt, for coefficients that `pendulum` has found."""

@@ -11,22 +11,23 @@ from numpy.typing import NDArray
 
 from lag_envs.report import reference
 from lag_envs.report.cases import VARIANTS
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import METHODS, comparison
-from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import motion_constants_of
 from lag_envs.stepping.compiling import compile_function
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SECTION = "conservation"
-OURS = "lag_envs"
+LAG_ENVS = "lag_envs"
 EPS = 2.0**-53
 COLOURS = {
-    OURS: "#000000",
+    LAG_ENVS: "#000000",
     "RK4": "#0072b2",
     "implicit midpoint": "#009e73",
     "Verlet": "#56b4e9",
@@ -35,7 +36,7 @@ COLOURS = {
 }
 
 
-class Free(NamedTuple):
+class FreeMotion(NamedTuple):
     """A scene without drag and drive, and a start."""
 
     scene: Scene
@@ -46,34 +47,37 @@ class Free(NamedTuple):
 
 _BAR = PivotedBar(track=None)
 _SHELL = CylinderInCylinder(control="damping")
-_TOP = 2.0 * math.sqrt(_BAR._constants()["alpha"])  #: speed at the bottom that reaches the top [rad/s]
+#: Speed at the bottom that reaches the top [rad/s].
+_TOP = 2.0 * math.sqrt(motion_constants_of(_BAR)["alpha"])
 
 FREE = {
-    "bar, 0.1 rad": Free(_BAR, (0.1, 0.0)),
-    "bar, 1.6 rad": Free(_BAR, (1.6, 0.0)),
-    "bar, 2 rad": Free(_BAR, (2.0, 0.0)),
-    "bar, 3.1 rad": Free(_BAR, (3.1, 0.0)),
-    "bar, turning over": Free(_BAR, (0.0, 1.2 * _TOP)),
-    "shell, 1 rad": Free(_SHELL, (1.0, 0.0)),
-    "incline": Free(Incline(tilt=math.pi / 12), (0.0, 1.0)),
+    "bar, 0.1 rad": FreeMotion(_BAR, (0.1, 0.0)),
+    "bar, 1.6 rad": FreeMotion(_BAR, (1.6, 0.0)),
+    "bar, 2 rad": FreeMotion(_BAR, (2.0, 0.0)),
+    "bar, 3.1 rad": FreeMotion(_BAR, (3.1, 0.0)),
+    "bar, turning over": FreeMotion(_BAR, (0.0, 1.2 * _TOP)),
+    "shell, 1 rad": FreeMotion(_SHELL, (1.0, 0.0)),
+    "incline": FreeMotion(Incline(tilt=math.pi / 12), (0.0, 1.0)),
 }
 QUICK = ("bar, 2 rad", "bar, turning over")
 #: Seconds over which positions are compared; each is a whole number of steps.
 STEPS, QUICK_STEPS = 10**7, 10**5
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: long free runs, and balances of driven, damped ones."""
     steps = QUICK_STEPS if quick else STEPS
     names = QUICK if quick else tuple(FREE)
     made = [
-        Job(SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps})
+        ReportJob(
+            SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps}
+        )
         for name in names
-        for method in (OURS, *(m for m in METHODS if m in COLOURS))
+        for method in (LAG_ENVS, *(m for m in METHODS if m in COLOURS))
     ]
     count = 50 if quick else 500
     return made + [
-        Job(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
+        ReportJob(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
         for name in (list(VARIANTS)[:1] if quick else VARIANTS)
     ]
 
@@ -93,7 +97,7 @@ def marks(steps: int) -> NDArray[np.int64]:
     return np.unique(np.round(np.geomspace(1, steps, count)).astype(np.int64))
 
 
-def march(scene: Stepped) -> Callable:
+def compile_march(scene: Stepped) -> Callable:
     """Compile ``march(out, marks, dt, x, constants...)`` for a scene without control.
 
     Row j of `out` is the lifted state after ``marks[j]`` steps, row -1 the start; it returns the number of
@@ -118,24 +122,24 @@ def march(scene: Stepped) -> Callable:
     return compile_function("march", "\n    ".join(lines) + "\n", code.compile())
 
 
-def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
+def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the lifted states after these numbers of steps; fewer rows if a step was refused."""
     stepped = Stepped(problem.scene, dt=problem.dt)
     largest = stepped.largest_majorant(problem.dt)
-    if method != OURS:
+    if method != LAG_ENVS:
         stepped = Stepped(problem.scene, comparison(method, stepped.flow))
     out = np.empty((len(at) + 1, stepped.width))
     out[-1] = stepped.lift(np.array(problem.state))
-    filled = march(stepped)(out, at, problem.dt, largest, *stepped.present())
+    filled = compile_march(stepped)(out, at, problem.dt, largest, *stepped.present())
     return out[:filled]
 
 
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
-    """Yield the drifts of a run without drag and drive, and for ours its error and the amplified rounding."""
+    """Yield the drifts of a run without drag and drive; for lag_envs also error and amplified rounding."""
     problem = FREE[name]
     scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
-    states = run(problem, method, at)
+    states = lifted_run(problem, method, at)
     at = at[: len(states)]
     row: Row = {"kind": "drift", "name": name, "method": method, "steps": at.tolist(), "dt": problem.dt}
     start = scene.energy(problem.state, 0.0)
@@ -151,7 +155,7 @@ def free(name: str, method: str, steps: int) -> Iterator[Row]:
     size = np.maximum(abs(start["kinetic"]) + abs(start["potential"]), np.abs(energy["kinetic"]))
     row["energy"] = finite((energy["total"] - start["total"]) / size)
     yield row
-    if method == OURS:
+    if method == LAG_ENVS:
         yield growth(name, at.tolist(), states)
 
 
@@ -168,13 +172,13 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
     errors, amplified = [], []
     for n, state in zip(at, states, strict=True):
         exact = reference.remembered(scene, start, 0.0, float(n) * dt)
-        errors.append(abs(reference.errors(state[:1], exact[:1])[0]))
+        errors.append(abs(reference.differences(state[:1], exact[:1])[0]))
         with mp.workdps(60):
             total = mpf(0)
             for j, value in enumerate(start):
                 moved = [mpf(x) for x in start]
                 moved[j] += EPS * mpf(max(abs(value), 1.0))
-                total += abs(reference.flow(scene, moved, 0.0, float(n) * dt)[0] - exact[0])
+                total += abs(reference.exact_flow(scene, moved, 0.0, float(n) * dt)[0] - exact[0])
         amplified.append(float(total))
     return {
         "kind": "growth", "name": name, "seconds": [float(n) * dt for n in at],
@@ -182,7 +186,7 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
     }  # fmt: skip
 
 
-def balance(variant: str, steps: int) -> Iterator[Row]:
+def energy_imbalance(variant: str, steps: int) -> Iterator[Row]:
     """Yield the imbalance of energy, work and loss over a run with random controls."""
     about = VARIANTS[variant]
     scene = about.scene()
@@ -261,7 +265,7 @@ BALANCE = (
 )
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     drifts, grown, balances = (
         [row for row in rows if row["kind"] == kind] for kind in ("drift", "growth", "balance")
@@ -272,7 +276,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         text=[TEXT[0].format(steps=steps), *TEXT[1:]],
         tables=_tables(drifts, grown, balances),
         pictures=list(_pictures(drifts, grown)),
-        claims=_claims([row for row in drifts if row["method"] == OURS], grown, balances, steps),
+        claims=_claims([row for row in drifts if row["method"] == LAG_ENVS], grown, balances, steps),
         summary=_summary(drifts, steps),
         details=[_all(drifts)],
     )
@@ -334,7 +338,7 @@ def _ratios(row: Row) -> list[float]:
     return (np.array(row["error"]) / (np.sqrt(steps) * np.array(row["amplified"]))).tolist()
 
 
-def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) -> list[Claim]:
+def _claims(own: list[Row], grown: list[Row], balances: list[Row], steps: int) -> list[Claim]:
     def claim(text: str, found: list[tuple[float | None, str]], limit: float) -> Claim:
         if not found:
             return Claim(text, None, "")
@@ -348,17 +352,17 @@ def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) 
         claim(
             f"On bar and shell energy drifts by less than {1e-17 * steps:.0e} of its size in {steps:,} steps,"
             " less than a tenth of a rounding per step.",
-            [(worst(row["energy"]), row["name"]) for row in ours if "length" in row],
+            [(worst(row["energy"]), row["name"]) for row in own if "length" in row],
             1e-17 * steps,
         ),
         claim(
             f"On the incline it drifts by less than {1e-16 * steps:.0e}, a rounding per step.",
-            [(worst(row["energy"]), row["name"]) for row in ours if "length" not in row],
+            [(worst(row["energy"]), row["name"]) for row in own if "length" not in row],
             1e-16 * steps,
         ),
         claim(
             "c² + s² stays within 1e-15 of 1.",
-            [(worst(row["length"]), row["name"]) for row in ours if "length" in row],
+            [(worst(row["length"]), row["name"]) for row in own if "length" in row],
             1e-15,
         ),
         claim(
@@ -391,22 +395,22 @@ def _summary(drifts: list[Row], steps: int) -> Table | None:
     return Table("conservation", caption, ("start", *methods), rows)
 
 
-def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[Picture]:
+def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[ReportFigure]:
     if drifts:
-        yield Picture(
+        yield ReportFigure(
             "conservation-energy",
             "Relative drift of energy over the number of control steps, the largest so far, without drag"
             " and drive.",
             lambda: _curves(drifts, "steps", "energy", "control steps", "relative drift of energy"),
         )
     if any("length" in row for row in drifts):
-        yield Picture(
+        yield ReportFigure(
             "conservation-length",
-            "c² + s² - 1 of the cosine and sine that ours carries along, at the marks of each run.",
-            lambda: _lengths([row for row in drifts if row["method"] == OURS and "length" in row]),
+            "c² + s² - 1 of the cosine and sine that lag_envs carries along, at the marks of each run.",
+            lambda: _lengths([row for row in drifts if row["method"] == LAG_ENVS and "length" in row]),
         )
     if grown:
-        yield Picture(
+        yield ReportFigure(
             "conservation-growth",
             "Error of θ (incline: x) of our runs against the closed form in 30 digits. Dotted: one "
             "rounding of the start, propagated by that closed form.",
@@ -429,14 +433,14 @@ def _panels(names: Sequence[str]) -> tuple[Figure, dict[str, Any]]:
 def _curves(rows: list[Row], x: str, y: str, xlabel: str, ylabel: str) -> Figure:
     names = list(dict.fromkeys(row["name"] for row in rows))
     figure, axes = _panels(names)
-    for row in sorted(rows, key=lambda row: row["method"] == OURS):
+    for row in sorted(rows, key=lambda row: row["method"] == LAG_ENVS):
         axis = axes[row["name"]]
         values = np.array([np.nan if v is None else abs(v) for v in row[y]])
         values = np.fmax.accumulate(np.maximum(values, 1e-17)) if len(values) else values
-        ours = row["method"] == OURS
+        own = row["method"] == LAG_ENVS
         axis.loglog(
-            row[x], values, color=COLOURS[row["method"]], lw=2.2 if ours else 1.1, label=row["method"],
-            zorder=3 if ours else 2,
+            row[x], values, color=COLOURS[row["method"]], lw=2.2 if own else 1.1, label=row["method"],
+            zorder=3 if own else 2,
         )  # fmt: skip
         axis.set_title(row["name"], fontsize=9)
         axis.set_ylim(1e-17, 1e3)
@@ -466,7 +470,7 @@ def _growths(rows: list[Row]) -> Figure:
     for row in rows:
         axis = axes[row["name"]]
         axis.loglog(
-            row["seconds"], np.maximum(row["error"], 1e-18), color="black", lw=1.8, label="error of ours"
+            row["seconds"], np.maximum(row["error"], 1e-18), color="black", lw=1.8, label="error of lag_envs"
         )
         axis.loglog(
             row["seconds"], row["amplified"], ":", color="#d55e00", lw=1.8, label="amplified rounding"

@@ -21,7 +21,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReportFigure:
     """A figure, drawn when it is written."""
 
     name: str  #: of the file
@@ -46,7 +46,7 @@ class Content:
     title: str
     text: Sequence[str]  #: paragraphs: what was measured, how, against which reference
     tables: Sequence[Table] = ()
-    pictures: Sequence[Picture] = ()
+    pictures: Sequence[ReportFigure] = ()
     claims: Sequence[Claim] = ()
     summary: Table | None = None  #: a small table for the README
     details: Sequence[Table] = field(default=())  #: long tables: CSV only

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.report.points import HORIZONS, MODES, Point
+from lag_envs.report.points import HORIZONS, MODES, WorkPrecisionPoint
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,13 +35,13 @@ STYLES = {
     "MuJoCo implicitfast": ("#B8860B", "^", ":"),
     "MuJoCo RK4": ("#B8860B", "D", ":"),
 }
-OURS = {"lag_envs": ("*", 15), "lag_envs, one call": ("p", 11)}
+OWN_STYLES = {"lag_envs": ("*", 15), "lag_envs, one call": ("p", 11)}
 DARK = "#003B5C"
 ROUNDED = "amplified rounding"
 LOWEST = 1e-17
 
 
-def draw(variant: str, points: Sequence[Point], floor: Mapping[tuple, float]) -> Figure:
+def draw_variant(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapping[tuple, float]) -> Figure:
     """Draw one variant: horizons side by side, alone above, a batch below."""
     from matplotlib.figure import Figure
 
@@ -63,14 +63,14 @@ def draw(variant: str, points: Sequence[Point], floor: Mapping[tuple, float]) ->
         for ax in axes.flat
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    names = [name for name in (*OURS, *STYLES, ROUNDED) if name in known]
+    names = [name for name in (*OWN_STYLES, *STYLES, ROUNDED) if name in known]
     figure.legend(
         [known[n] for n in names], names, loc="outside lower center", ncols=6, fontsize=8.5, frameon=False
     )
     return figure
 
 
-def panel(ax: Axes, points: Sequence[Point], floor: float | None) -> None:
+def panel(ax: Axes, points: Sequence[WorkPrecisionPoint], floor: float | None) -> None:
     """Draw all curves of one horizon and mode."""
     ax.set_xscale("log")
     ax.set_yscale("log")
@@ -84,18 +84,18 @@ def panel(ax: Axes, points: Sequence[Point], floor: float | None) -> None:
         _curve(
             ax, curve, label=name, color=colour, marker=marker, linestyle=line, linewidth=1.0, markersize=3.5
         )
-    for method, (marker, size) in OURS.items():
+    for method, (marker, size) in OWN_STYLES.items():
         _curve(
-            ax, [p for p in points if p.ours and p.method == method], label=method, marker=marker,
+            ax, [p for p in points if p.own and p.method == method], label=method, marker=marker,
             markersize=size, color=DARK, linestyle="", markeredgecolor="white", zorder=6,
         )  # fmt: skip
 
 
-def curves(points: Sequence[Point]) -> dict[str, list[Point]]:
+def curves(points: Sequence[WorkPrecisionPoint]) -> dict[str, list[WorkPrecisionPoint]]:
     """Return a curve for each rival: of all forms of a method, the points that no other form beats."""
-    found: dict[str, list[Point]] = {}
+    found: dict[str, list[WorkPrecisionPoint]] = {}
     for p in points:
-        if not p.ours:
+        if not p.own:
             found.setdefault(p.name.partition(",")[0], []).append(p)
     return {
         name: sorted(
@@ -105,11 +105,11 @@ def curves(points: Sequence[Point]) -> dict[str, list[Point]]:
     }
 
 
-def _height(p: Point) -> float:
+def _height(p: WorkPrecisionPoint) -> float:
     return 1.0 if p.diverged or p.error is None else max(p.error, 1.3 * LOWEST)
 
 
-def _curve(ax: Axes, points: Sequence[Point], **style: Any) -> None:
+def _curve(ax: Axes, points: Sequence[WorkPrecisionPoint], **style: Any) -> None:
     if not points:
         return
     ax.plot([p.ns for p in points], [_height(p) for p in points], **style)

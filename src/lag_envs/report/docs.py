@@ -19,24 +19,24 @@ from typing import Any, NamedTuple
 
 from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.report import overview, page
-from lag_envs.report.content import Picture, Table
+from lag_envs.report.content import ReportFigure, Table
 from lag_envs.report.report import FILE, content_of
-from lag_envs.store import write
+from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
 
 FIGURES = "images/accuracy"
 LARGEST_SVG = 200_000  #: bytes
 DETAILS = "accuracy-details.md"
-OVERVIEW = Picture(
+OVERVIEW = ReportFigure(
     "overview",
     "Error against run time. The shortest time of one control step in which each method reaches an error, "
     "with only the state, not in a batch. Rivals get their fastest form.",
-    lambda: overview.draw({}),
+    lambda: overview.draw_overview({}),
     raster=True,
 )
 
 
-class Part(NamedTuple):
+class PagePart(NamedTuple):
     """A part of the page to read: a section of the report, with words that hold for any measurement."""
 
     section: str
@@ -46,16 +46,16 @@ class Part(NamedTuple):
 
 
 PARTS = (
-    Part(
+    PagePart(
         "work_precision",
         "One step of the package's scenes",
-        "Bar, incline and shell have dedicated steps. Ours is as shipped, at rounding error; a rival is "
+        "Bar, incline and shell have dedicated steps. lag_envs is as shipped, at rounding error; a rival is "
         "given the scene's own equation and its fastest form, with the setting that just reaches an "
-        "error. Only ours has a bound on its error before the step. The table names the fastest rival "
-        "for each error, with its time as a multiple of ours: below 1 the rival is faster.",
+        "error. Only lag_envs has a bound on its error before the step. The table names the fastest rival "
+        "for each error, with its time as a multiple of that of lag_envs: below 1 the rival is faster.",
         (),
     ),
-    Part(
+    PagePart(
         "general",
         "One step of scenes defined by energies alone",
         "Here the equations are derived from the energies and stepped by the general Taylor series, which "
@@ -63,7 +63,7 @@ PARTS = (
         "known here only from exact solutions.",
         ("general-double",),
     ),
-    Part(
+    PagePart(
         "environments",
         "Whole episodes",
         "Episodes of random actions, compared with the exact motion under the same controls. Gymnasium's "
@@ -72,7 +72,7 @@ PARTS = (
         "the last column has the error as a multiple of that.",
         ("environment-errors.png",),
     ),
-    Part(
+    PagePart(
         "stability",
         "Stiffness and extremes",
         "Each cell of a map is one control step, for increasing damping and step length. Heavy damping "
@@ -80,21 +80,21 @@ PARTS = (
         "cases, from a bar of 1e-8 m to drives of 1e6: each is either accurate or refused with an error.",
         ("stability-damping-pivotedbar.png", "extreme-cases-map"),
     ),
-    Part(
+    PagePart(
         "conservation",
         "Conservation",
         "Without drag and drive, energy must not change. The table has its largest drift over a very long "
         "run.",
         ("conservation-energy",),
     ),
-    Part(
+    PagePart(
         "bound",
         "The bound",
         "The bound on a step's truncation error is proved ([numerics](numerics.md), [engine](engine.md)). "
         "Here it is compared with the actual truncation errors: every point must lie left of the line.",
         ("bound-scatter",),
     ),
-    Part(
+    PagePart(
         "leave_out",
         "What is left out",
         "A constant that is zero costs no operation, and the state holds only what an environment "
@@ -137,8 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for old in figures.iterdir():
         old.unlink()
     contents = content_of(found)
-    files = {p.name: drawn(p, figures).name for content in contents.values() for p in content.pictures}
-    write(docs / "accuracy.json", json.dumps(compact(found, files), indent=1, allow_nan=False) + "\n")
+    files = {p.name: drawn_figure(p, figures).name for content in contents.values() for p in content.pictures}
+    write_file(docs / "accuracy.json", json.dumps(compact(found, files), indent=1, allow_nan=False) + "\n")
     update(args.project)
     return 0
 
@@ -146,9 +146,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def update(project: Path) -> None:
     """Write the files that depend on ``docs/accuracy.json`` and ``docs/speed.json``: pages, first figure."""
     for path, text in generated(project).items():
-        write(path, text)
+        write_file(path, text)
     accuracy = json.loads((project / "docs" / "accuracy.json").read_text(encoding="utf-8"))
-    page.draw(replace(OVERVIEW, draw=lambda: overview.draw(accuracy)), project / "docs" / FIGURES)
+    page.write_figure(
+        replace(OVERVIEW, draw=lambda: overview.draw_overview(accuracy)), project / "docs" / FIGURES
+    )
 
 
 def generated(project: Path) -> dict[Path, str]:
@@ -157,17 +159,17 @@ def generated(project: Path) -> dict[Path, str]:
         json.loads((project / "docs" / name).read_text(encoding="utf-8"))
         for name in ("accuracy.json", "speed.json")
     )
-    pages = {"accuracy.md": markdown(accuracy), DETAILS: details(accuracy)}
+    pages = {"accuracy.md": accuracy_markdown(accuracy), DETAILS: details(accuracy)}
     return {project / "docs" / name: text for name, text in pages.items()} | speed_texts(speed, project)
 
 
-def drawn(picture: Picture, folder: Path) -> Path:
+def drawn_figure(picture: ReportFigure, folder: Path) -> Path:
     """Draw a figure; one that is too large as SVG becomes PNG."""
-    path = page.draw(picture, folder)
+    path = page.write_figure(picture, folder)
     if picture.raster or path.stat().st_size <= LARGEST_SVG:
         return path
     path.unlink()
-    return page.draw(replace(picture, raster=True), folder)
+    return page.write_figure(replace(picture, raster=True), folder)
 
 
 def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
@@ -196,7 +198,7 @@ def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
 # --- texts ---
 
 
-def markdown(accuracy: dict[str, Any]) -> str:
+def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     """Return docs/accuracy.md, the page to read."""
     sections = {section["name"]: section for section in accuracy["sections"]}
     claims = [claim for section in accuracy["sections"] for claim in section["claims"]]
@@ -213,7 +215,7 @@ def markdown(accuracy: dict[str, Any]) -> str:
         "",
         "The main results:",
         "",
-        *(f"- {text}" for text in (*FIRST, *overview.findings(accuracy))),
+        *(f"- {text}" for text in (*FIRST, *overview.overview_sentences(accuracy))),
         "",
         *_command("work_precision,general"),
         "## What is promised",
@@ -266,9 +268,9 @@ look).
 It also writes a page with all rows as CSV and JSON."""
 
 FIRST = (
-    "Only ours has a bound on its error that is known before or with the step. The errors of the others were "
-    "found afterwards, from exact solutions.",
-    "On the left, ours is at rounding error. A coarser setting would not be faster, so there is one point.",
+    "Only lag_envs has a bound on its error that is known before or with the step. The errors of the others "
+    "were found afterwards, from exact solutions.",
+    "On the left, lag_envs is at rounding error. A coarser setting would not be faster, so it has one point.",
 )
 
 
@@ -313,7 +315,7 @@ def _about(accuracy: dict[str, Any]) -> list[str]:
     machine = accuracy["machine"]
     return [
         f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']};"
-        f" {accuracy['settings']['date']}; {page.cell(accuracy['job_seconds'])} s of work.",
+        f" {accuracy['settings']['date']}; {page.cell_text(accuracy['job_seconds'])} s of work.",
         "",
         ", ".join(f"{name} {number}" for name, number in accuracy["versions"].items()) + ".",
     ]
@@ -326,7 +328,9 @@ def _anchor(title: str) -> str:
 
 def _table(table: dict[str, Any] | Table) -> str:
     parts = vars(table) if isinstance(table, Table) else table
-    return markdown_table(parts["columns"], [[page.cell(value) for value in row] for row in parts["rows"]])
+    return markdown_table(
+        parts["columns"], [[page.cell_text(value) for value in row] for row in parts["rows"]]
+    )
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.episodes import DIGITS, TIMES
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.runner import JobResult, Row
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS
 
@@ -22,7 +23,7 @@ LARGEST_STEP, LARGEST_ERROR, ROUNDINGS = 1e-15, 1e-13, 100.0
 #: The accuracy that any scene promises of a step. The certificate requires less truncation error, but
 #: measures a velocity by energy, and a light body's velocity may be small compared to that measure.
 PROMISED = 1e-12
-APART = 1e9  #: Gymnasium's errors should be larger than ours by at least this factor
+APART = 1e9  #: Gymnasium's errors should be larger than those of lag_envs by at least this factor
 #: The undriven pendulum is released at rest, this far from hanging [rad]; it is compared over the first time,
 #: its energy over the second [s].
 RELEASED, COMPARED, LONG = 2.5, 10.0, 100.0
@@ -32,7 +33,7 @@ BLUE, GREY = "#0072b2", "#666666"
 COLOURS = {"Pendulum-v1": "#d55e00", "CartPole-v1": "#cc79a7", "Acrobot-v1": "#009e73"}
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     cases = {case: [r for r in rows if r["case"] == case] for case in dict.fromkeys(r["case"] for r in rows)}
     episodes = {case: group for case, group in cases.items() if group[0]["seed"] is not None}
@@ -41,7 +42,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     pictures = []
     if episodes:
         pictures = [
-            Picture(
+            ReportFigure(
                 "environment-errors",
                 "Error of whole episodes (the first 1,000 steps of longer ones), relative to the size of the "
                 "state, as the largest up to a time. "
@@ -50,7 +51,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
                 "rounding of the start, propagated in exact arithmetic.",
                 lambda: _draw_all(episodes),
             ),
-            Picture(
+            ReportFigure(
                 "environment-errors-each",
                 "The same, environment by environment. Solid: error of an episode. Dotted: one rounding of "
                 "its start, amplified by the system itself.",
@@ -72,9 +73,9 @@ def _text() -> list[str]:
     return [
         "Episodes are recorded from gym.make under random actions: float64 states, and the controls that "
         "were applied. The exact motion has the same start and the same controls, without rounding in "
-        f"between. The oracle computes it with {DIGITS} digits, and for the first seed of ours again with "
-        f"{DIGITS + 12}. Where a task has random kicks, they are computed by its own formula from the "
-        "environment's own random numbers, without rounding.",
+        f"between. The oracle computes it with {DIGITS} digits, and for the first seed of lag_envs's own "
+        f"again with {DIGITS + 12}. Where a task has random kicks, they are computed by its own formula from "
+        "the environment's own random numbers, without rounding.",
         "Gymnasium's equations are those of scenes with the parameters of each instance. Its environments "
         "clip velocities: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 "
         "wraps are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, since its "
@@ -92,8 +93,8 @@ def _text() -> list[str]:
         "within a narrow range of speeds, it comes close to that limit, which is many roundings.",
         "The error of one step is the largest of any step of the episode. Each step is repeated in exact "
         "arithmetic from the state recorded before it, and compared with the state recorded after it. "
-        "Ours carry cosine and sine beside the angle. If an angle has grown to many turns, its rounding "
-        "and theirs differ, and this counts as error too.",
+        "lag_envs carries cosine and sine beside the angle. If an angle has grown to many turns, its "
+        "rounding differs from that of the pair, and this counts as error too.",
     ]
 
 
@@ -111,8 +112,8 @@ def _ratio(row: Row) -> float:
 
 
 def _is_general(row: Row) -> bool:
-    """Tell whether an environment of ours is stepped by the general series."""
-    return TASKS[row["case"]]().scene._form is None
+    """Return whether an environment of lag_envs is stepped by the general series."""
+    return form_of(TASKS[row["case"]]().scene) is None
 
 
 def _share(row: Row) -> float:
@@ -187,10 +188,10 @@ def _free_table(free: dict[str, list[Row]]) -> Table:
     return Table(
         "environment-undriven",
         f"A pendulum without control, released at rest {RELEASED} rad from hanging: the error of its angle, "
-        f"and how much its energy above rest, which should be constant, grows in {LONG:g} s. Ours has the "
-        "equation of motion of Pendulum-v1. A step of 0.05 s is 2.5 times the one that its series is "
-        "designed for, so the error is truncation within the 1e-12 rad/s allowed per step; with 0.02 s "
-        "only rounding is left. CartPole-v1 is given no force.",
+        f"and how much its energy above rest, which should be constant, grows in {LONG:g} s. The lag_envs "
+        "pendulum has the equation of motion of Pendulum-v1. A step of 0.05 s is 2.5 times the one that its "
+        "series is designed for, so the error is truncation within the 1e-12 rad/s allowed per step; with "
+        "0.02 s only rounding is left. CartPole-v1 is given no force.",
         [
             *("case", "integrator", "dt [s]", "angle, one step [rad]", "up to 1 s [rad]"),
             *("up to 10 s [rad]", "amplified rounding", "error over amplified rounding"),
@@ -237,11 +238,11 @@ def _summary(episodes: dict[str, list[Row]]) -> Table | None:
 
 
 def _claims(rows: list[Row]) -> list[Claim]:
-    made = [r for r in rows if r["ours"] and r["seed"] is not None]
-    peers = [r for r in rows if not r["ours"] and r["seed"] is not None]
+    made = [r for r in rows if r["own"] and r["seed"] is not None]
+    peers = [r for r in rows if not r["own"] and r["seed"] is not None]
     apart = [r["disagreement"] for r in made if "disagreement" in r]
     free = [r for r in rows if r["seed"] is None]
-    same = {r["ours"]: r for r in free if "Pendulum-v1" in r["case"] and r["dt"] == 0.05}
+    same = {r["own"]: r for r in free if "Pendulum-v1" in r["case"] and r["dt"] == 0.05}
     twins = [r for r in made if TASKS[r["case"]].peer]
     twin = max(twins, key=lambda r: r["error"]["the end"], default=None)
     least = min(peers, key=lambda r: r["error"]["the end"], default=None)
@@ -274,7 +275,7 @@ def _claims(rows: list[Row]) -> list[Claim]:
         ),
         Claim(
             f"Every episode of Gymnasium's environments is off by more than {APART:g} times the largest "
-            "error of ours that have the same equations.",
+            "error of lag_envs with the same equations.",
             least["error"]["the end"] > APART * twin["error"]["the end"] if twin and least else None,
             f"{least['case']}: at least {least['error']['the end']:.2g}, "
             f"{least['error']['the end'] / twin['error']['the end']:.1g} times that of {twin['case']}"
@@ -283,7 +284,7 @@ def _claims(rows: list[Row]) -> list[Claim]:
         ),
         Claim(
             "On the undriven pendulum with the same equation and step, Pendulum-v1 is off by more than "
-            f"{APART:g} times as much as ours, after 10 s.",
+            f"{APART:g} times as much as lag_envs, after 10 s.",
             _angle(same[False]) > APART * _angle(same[True]) if len(same) == 2 else None,
             "; ".join(f"{r['case']}, dt {r['dt']:g} s: {_angle(r):.3g} rad" for r in free),
         ),
@@ -313,7 +314,7 @@ def _angle(row: Row) -> float:
 
 
 def _colour(row: Row) -> str:
-    return BLUE if row["ours"] else COLOURS[row["case"].partition(",")[0]]
+    return BLUE if row["own"] else COLOURS[row["case"].partition(",")[0]]
 
 
 def _curve(row: Row) -> tuple[list[float], list[float], list[float]]:
@@ -328,12 +329,12 @@ def _draw_all(episodes: dict[str, list[Row]]) -> Figure:
     figure = Figure(figsize=(8, 5.2), layout="constrained")
     axes = figure.add_subplot()
     named: set[str] = set()
-    for row in sorted(itertools.chain(*episodes.values()), key=lambda r: r["ours"]):
-        name = "lag_envs, all environments" if row["ours"] else row["case"].partition(",")[0]
+    for row in sorted(itertools.chain(*episodes.values()), key=lambda r: r["own"]):
+        name = "lag_envs, all environments" if row["own"] else row["case"].partition(",")[0]
         times, errors, amplified = _curve(row)
         label = None if name in named else name
         named.add(name)
-        axes.plot(times, errors, color=_colour(row), lw=1.8 if row["ours"] else 1.2, label=label)
+        axes.plot(times, errors, color=_colour(row), lw=1.8 if row["own"] else 1.2, label=label)
         axes.plot(times, amplified, color=_colour(row), lw=0.7, ls=":")
     axes.plot([], [], color=GREY, lw=1, ls=":", label="one rounding of the start, amplified")
     axes.set(xscale="log", yscale="log", xlabel="time in the episode [s]", ylim=(1e-18, 30))

@@ -1,4 +1,4 @@
-"""The error of whole episodes: every environment of ours, and those of the same kind in Gymnasium.
+"""The error of whole episodes: every environment of lag_envs, and those of the same kind in Gymnasium.
 
 An episode is recorded as it comes out of ``gym.make``: its float64 states, and the controls that were
 applied. `episodes` compares it with the exact one, `gymnasium_peers` has Gymnasium's equations, and
@@ -20,34 +20,35 @@ from lag_envs import TASKS
 from lag_envs.report.environment_results import COMPARED, LONG, RELEASED, content
 from lag_envs.report.episodes import (
     DIGITS,
-    Episode,
-    compare,
-    entries,
-    moved,
-    play,
-    random_actions,
-    replay,
-    stepping,
+    RecordedEpisode,
+    endless_actions,
+    entry_errors,
+    episode_errors,
+    exact_states,
+    exact_stepping,
+    moved_start,
+    record_episode,
 )
-from lag_envs.report.gymnasium_peers import PEERS, measure, random_episode, watch
-from lag_envs.report.runner import Job, Row
+from lag_envs.report.gymnasium_peers import PEERS, measure_peer, random_episode, record_peer
+from lag_envs.report.runner import ReportJob, Row
+from lag_envs.scenes.derivation import order_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.pivoted_bar import SwingUpFree
 
-__all__ = ["content", "jobs", "ours", "theirs", "undriven"]
+__all__ = ["content", "jobs", "own_episode", "peer_episode", "undriven"]
 
 SECTION = "environments"
 #: Longest episode in control steps: each is followed several times to more than 30 digits.
 MOST_STEPS = 1_000
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: one per environment and seed. Quick: one seed, the first second of each episode."""
     seeds = range(1 if quick else 5)
     seconds = 1.0 if quick else None
     made = [
-        Job(
-            SECTION, f"{id}, seed {seed}", "environments:ours",
+        ReportJob(
+            SECTION, f"{id}, seed {seed}", "environments:own_episode",
             {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())}, timeout=600.0,
         )
         for id, kind in TASKS.items()
@@ -55,8 +56,11 @@ def jobs(quick: bool) -> list[Job]:
         for seed in seeds
     ]  # fmt: skip
     made += [
-        Job(
-            SECTION, f"{id}, seed {seed}", "environments:theirs", {"id": id, "seed": seed, "seconds": seconds}
+        ReportJob(
+            SECTION,
+            f"{id}, seed {seed}",
+            "environments:peer_episode",
+            {"id": id, "seed": seed, "seconds": seconds},
         )
         for id in PEERS
         for seed in (seeds[:3] if id == "Acrobot-v1" else seeds)  # its episodes last 100 s
@@ -64,9 +68,11 @@ def jobs(quick: bool) -> list[Job]:
     free: list[dict[str, Any]] = [{"id": id} for id in ("", *UNDRIVEN)]
     if not quick:
         free.insert(1, {"id": "", "dt": 0.02})
-    names = [f"{f['id'] or 'ours'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free]
+    names = [
+        f"{f['id'] or 'lag_envs'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free
+    ]
     return made + [
-        Job(SECTION, name, "environments:undriven", arguments)
+        ReportJob(SECTION, name, "environments:undriven", arguments)
         for name, arguments in zip(names, free, strict=True)
     ]
 
@@ -79,25 +85,25 @@ def longest(task: Task) -> float | None:
 # --- what is measured ---
 
 
-def ours(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
+def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
     """Yield one row: an episode of our environment against the exact one."""
     options: dict[str, Any] = {} if duration is None else {"duration": duration}
     env = gym.make(id, disable_env_checker=True, **options)
     env.reset(seed=seed)
-    episode = play(env, random_actions(env, seed))
+    episode = record_episode(env, endless_actions(env, seed))
     row = against_exact(env.unwrapped.task, episode, seed, vouch=seed == 0)  # type: ignore[attr-defined]
     yield row | {"case": id, "seed": seed}
 
 
-def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) -> Row:
-    """Return the row of an episode of ours; if asked, computed twice, with the difference of the two."""
+def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool = False) -> Row:
+    """Return the row of an episode of lag_envs; if asked, computed twice, with the difference of the two."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
-        return replay(task, seed, start, episode.controls, digits)
+        return exact_states(task, seed, start, episode.controls, digits)
 
-    path, step = exact(episode.states[0]), stepping(task, seed, DIGITS)
+    path, step = exact(episode.states[0]), exact_stepping(task, seed, DIGITS)
     alone = [step(y, i, u) for i, (y, u) in enumerate(zip(episode.states, episode.controls, strict=False), 1)]
-    row = compare(episode, path, exact(moved(episode.states), DIGITS - 10), alone, task.dt)
+    row = episode_errors(episode, path, exact(moved_start(episode.states), DIGITS - 10), alone, task.dt)
     if vouch:
         row["disagreement"] = float(
             max(
@@ -106,20 +112,20 @@ def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) 
                 for a, b in zip(x, y, strict=True)
             )
         )
-    order = task.scene._order(task.dt)
+    order = order_of(task.scene, task.dt)
     row |= {
-        "ours": True,
+        "own": True,
         "integrator": f"Taylor series, order {order}" if order else "exact flow",
-        "entries": entries(row.pop("each"), task.scene.state_names, task.scene.state_units),
+        "entries": entry_errors(row.pop("each"), task.scene.state_names, task.scene.state_units),
     }
     return row
 
 
-def theirs(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
+def peer_episode(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
     """Yield rows of one of Gymnasium's environments under random actions.
 
-    CartPole-v1 falls within half a second; a second row goes on to 10 s, by its own update, as if it had not
-    ended.
+    CartPole-v1 falls within half a second; a second row continues to 10 s, by its own update, as if it had
+    not ended.
     """
     seconds = seconds or {"Acrobot-v1": 100.0}.get(id, 10.0)
     steps = round(seconds / PEERS[id].step(gym.make(id, disable_env_checker=True).unwrapped))
@@ -128,7 +134,7 @@ def theirs(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
         cases["CartPole-v1, past its end"] = False
     for case, to_the_end in cases.items():
         env, episode, used = random_episode(id, seed, steps, to_the_end)
-        yield measure(env, PEERS[id], episode) | {"case": case, "seed": used}
+        yield measure_peer(env, PEERS[id], episode) | {"case": case, "seed": used}
 
 
 # --- the undriven pendulum ---
@@ -138,7 +144,7 @@ UNDRIVEN: dict[str, tuple[dict[str, float], Any]] = {
     "Pendulum-v1": ({}, np.zeros(1, np.float32)),
     "CartPole-v1": ({"force_mag": 0.0}, 0),
 }
-#: Makes an environment of ours with Pendulum-v1's equation of motion: a rod of 1 m and 1 kg.
+#: Makes an environment of lag_envs with Pendulum-v1's equation of motion: a rod of 1 m and 1 kg.
 TWIN: dict[str, Any] = {
     "mass": 1.0,
     "com_distance": 0.5,
@@ -149,18 +155,18 @@ TWIN: dict[str, Any] = {
 
 
 def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
-    """Yield a row of a pendulum without control, released at rest: a peer's, or ours with the same equation.
+    """Yield a row of an undriven pendulum, released at rest: Gymnasium's, or one with the same equation.
 
-    ``dt`` is our control step [s], by default that of Pendulum-v1.
+    ``dt`` is the control step of lag_envs [s], by default that of Pendulum-v1.
 
     ``gain`` is the relative growth of energy above rest in 100 s.
     """
     if not id:
         env: Any = gym.make(SwingUpFree.id, disable_env_checker=True, **TWIN, dt=dt)
         env.reset(seed=0, options={"state": [RELEASED, 0.0]})
-        episode = play(env, itertools.repeat(np.zeros(1, np.float32)))
+        episode = record_episode(env, itertools.repeat(np.zeros(1, np.float32)))
         scene = env.unwrapped.scene
-        row = against_exact(env.unwrapped.task, first(episode, dt), seed=0)
+        row = against_exact(env.unwrapped.task, compared_part(episode, dt), seed=0)
         energy = scene.energy(episode.states)["total"] - scene.energy([0.0, 0.0])["total"]
         case = f"{SwingUpFree.id} with Pendulum-v1's equation, undriven"
     else:
@@ -170,8 +176,8 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
         vars(env).update(changes)
         env.state = np.array([*[0.0] * (len(peer.order) - 2), math.pi - RELEASED, 0.0])
         dt = peer.step(env)
-        episode = watch(env, peer, itertools.repeat(action), round(LONG / dt), to_the_end=False)
-        row = measure(env, peer, first(episode, dt))
+        episode = record_peer(env, peer, itertools.repeat(action), round(LONG / dt), to_the_end=False)
+        row = measure_peer(env, peer, compared_part(episode, dt))
         hanging = [*[0.0] * (len(peer.order) - 2), math.pi, 0.0]
         scene = peer.scene(env)
         energy = scene.energy(episode.states)["total"] - scene.energy(hanging)["total"]
@@ -179,7 +185,7 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
     yield row | {"case": case, "seed": None, "gain": float(energy[-1] / energy[0] - 1.0)}
 
 
-def first(episode: Episode, dt: float) -> Episode:
+def compared_part(episode: RecordedEpisode, dt: float) -> RecordedEpisode:
     """Return the part of an undriven episode that is compared."""
     steps = round(COMPARED / dt)
-    return Episode(episode.states[: steps + 1], episode.controls[:steps], False)
+    return RecordedEpisode(episode.states[: steps + 1], episode.controls[:steps], False)

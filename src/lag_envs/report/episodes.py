@@ -32,7 +32,7 @@ TIMES = (1.0, 5.0, 10.0)
 POINTS = 120  #: of a curve in the picture
 
 
-class Episode(NamedTuple):
+class RecordedEpisode(NamedTuple):
     """A recorded episode: ``controls[i]`` was held from ``states[i]`` to ``states[i + 1]``."""
 
     states: Array
@@ -40,7 +40,7 @@ class Episode(NamedTuple):
     terminated: bool
 
 
-def play(env: gym.Env, actions: Iterator[Any]) -> Episode:
+def record_episode(env: gym.Env, actions: Iterator[Any]) -> RecordedEpisode:
     """Record an episode of one of our environments, which has just been reset."""
     inner: Any = env.unwrapped
     states, controls, terminated, truncated = [inner.state], [], False, False
@@ -48,17 +48,17 @@ def play(env: gym.Env, actions: Iterator[Any]) -> Episode:
         _, _, terminated, truncated, _ = env.step(next(actions))
         states.append(inner.state)
         controls.append(inner.control)
-    return Episode(np.array(states), controls, terminated)
+    return RecordedEpisode(np.array(states), controls, terminated)
 
 
-def random_actions(env: gym.Env, seed: int) -> Iterator[Any]:
+def endless_actions(env: gym.Env, seed: int) -> Iterator[Any]:
     """Return an endless sequence of actions."""
     env.action_space.seed(seed)
     while True:
         yield env.action_space.sample()
 
 
-def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int, float], list[mpf]]:
+def exact_stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int, float], list[mpf]]:
     """Return a function for exact steps of our environment, from a state, with a number from 1 and a control.
 
     Kicks are those of the first episode after a reset with that seed, from the task's own formula and the
@@ -80,11 +80,11 @@ def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int
     return step
 
 
-def replay(
+def exact_states(
     task: Task, seed: int, start: Sequence[Any], controls: Sequence[float], digits: int
 ) -> list[list[mpf]]:
     """Return the exact states of one of our episodes: the first one after a reset with that seed."""
-    step = stepping(task, seed, digits)
+    step = exact_stepping(task, seed, digits)
     path = [[mpf(x) for x in start]]
     for number, control in enumerate(controls, start=1):
         path.append(step(path[-1], number, control))
@@ -99,14 +99,14 @@ def sizes(states: Array) -> Array:
     return np.maximum(1.0, np.abs(states).max(axis=0))
 
 
-def moved(states: Array) -> list[mpf]:
+def moved_start(states: Array) -> list[mpf]:
     """Return the start with every entry moved by one rounding of its size."""
     with mp.workdps(60):
         return [mpf(x) + EPS * mpf(size) for x, size in zip(states[0], sizes(states), strict=True)]
 
 
-def compare(
-    episode: Episode,
+def episode_errors(
+    episode: RecordedEpisode,
     path: list[list[mpf]],
     shifted: list[list[mpf]],
     alone: list[list[mpf]],
@@ -133,7 +133,7 @@ def compare(
     states, scale = episode.states, sizes(episode.states)
 
     def errors(states: Array, exact: list[list[mpf]]) -> Array:
-        each = np.array([reference.errors(a, b) for a, b in zip(states, exact, strict=True)])
+        each = np.array([reference.differences(a, b) for a, b in zip(states, exact, strict=True)])
         for i in wraps:
             each[:, i] = np.remainder(each[:, i] + math.pi, 2.0 * math.pi) - math.pi
         return np.abs(each)
@@ -167,7 +167,7 @@ def compare(
     }
 
 
-def entries(each: dict[str, Any], names: Sequence[str], units: Sequence[str]) -> list[Row]:
+def entry_errors(each: dict[str, Any], names: Sequence[str], units: Sequence[str]) -> list[Row]:
     """Return for each state entry its name, unit, size, and the error up to each mark in that unit."""
     return [
         {"name": name, "unit": unit, "size": each["the end"][i][1]}

@@ -27,6 +27,7 @@ from lag_envs.report.cases import Case
 from lag_envs.report.flow_equations import EQUATIONS
 from lag_envs.report.integrators import METHODS, comparison, explicit
 from lag_envs.report.stepped import Stepped
+from lag_envs.scenes.derivation import motion_constants_of
 
 Array = NDArray[np.float64]
 
@@ -123,7 +124,7 @@ class Problems:
     def __init__(self, cases: Sequence[Case]) -> None:
         self.cases = list(cases)
         self._stepped = scene = Stepped(self.cases[0].scene)
-        constants = [case.scene._constants() for case in self.cases]
+        constants = [motion_constants_of(case.scene) for case in self.cases]
         self._k = SimpleNamespace(**{name: np.array([k[name] for k in constants]) for name in constants[0]})
         self._u = np.array([case.control for case in self.cases])
         states = np.array([case.state for case in self.cases])

@@ -159,7 +159,7 @@ def amplification(case: Case, dt: float) -> list[float]:
             for sign in (1, -1):
                 start = [mpf(x) for x in state]
                 start[j] += sign * EPS * mpf(size)
-                end = reference.flow(scene, start, control, dt)
+                end = reference.exact_flow(scene, start, control, dt)
                 moved.append([abs(a - b) for a, b in zip(end, base, strict=True)])
             for i, changes in enumerate(zip(*moved, strict=True)):
                 total[i] += float(max(changes)) / EPS
@@ -187,13 +187,13 @@ def substeps(case: Case, dt: float) -> int:
     return int(status)
 
 
-def build(extreme: Extreme) -> Case:
+def built_case(extreme: Extreme) -> Case:
     """Return the case; raises the scene's own errors."""
     scene: Scene = getattr(scenes, extreme.scene)(**extreme.parameters)
     return Case(scene, tuple(map(float, extreme.state)), extreme.control)
 
 
-def measure(name: str) -> Row:
+def measure_extreme(name: str) -> Row:
     """Take a case's step and return a row with its outcome.
 
     ``error`` is the largest error of an entry relative to its scale, ``amplification`` the largest effect of
@@ -204,7 +204,7 @@ def measure(name: str) -> Row:
     row: Row = {"name": name, "scene": extreme.scene, "expected": extreme.expected, "dt": extreme.dt}
     row |= dict.fromkeys(("error", "amplification", "roundings", "substeps"))
     try:
-        case = build(extreme)
+        case = built_case(extreme)
         end = case.scene.simulate(case.state, [case.control], extreme.dt)[-1]
     except (StepRefused, ValueError) as error:
         outcome = REFUSED
@@ -213,7 +213,7 @@ def measure(name: str) -> Row:
     if extreme.expected == REFUSED:
         return row | {"outcome": "taken", "met": False, "message": ""}
     exact = reference.remembered(case.scene, case.state, case.control, extreme.dt)
-    errors = [abs(e) for e in reference.errors(end, exact)]
+    errors = [abs(e) for e in reference.differences(end, exact)]
     sizes, gains = scales(case, extreme.dt), amplification(case, extreme.dt)
     limits = [(EXACT * s, ROUNDINGS * EPS * g) for s, g in zip(sizes, gains, strict=True)]
     row["error"] = max(e / s for e, s in zip(errors, sizes, strict=True))

@@ -9,7 +9,7 @@ from typing import Any
 import sympy
 
 
-class Formulas:
+class OperationList:
     """Expressions as a list of operations, for numbers of any kind and for series of balls.
 
     Parameters
@@ -134,7 +134,7 @@ def reduced(expression: Any) -> Any:
     return sympy.expand(sympy.expand(expression).replace(square, lambda **w: turned(w["sine"], w["n"])))
 
 
-class Series:
+class FormulaSeries:
     """The values of formulas as Taylor series in time, coefficient by coefficient.
 
     Parameters
@@ -147,7 +147,7 @@ class Series:
         The formulas' constants.
     """
 
-    def __init__(self, formulas: Formulas, given: Sequence[list], constants: Sequence[Any]) -> None:
+    def __init__(self, formulas: OperationList, given: Sequence[list], constants: Sequence[Any]) -> None:
         self._formulas, self._constants = formulas, constants
         self._y: list[list] = [*given, *([] for _ in range(formulas.size - len(given)))]
         self._first = len(given)

@@ -1,4 +1,4 @@
-"""Scenes defined by energies alone: error against time beside other engines, certificates, energy.
+"""Scenes defined by energies alone: error against time compared with other engines, certificates, energy.
 
 Each system takes one control step from the same harsh states, with every joint turning fast at once. All
 rivals run in compiled loops, many states in one call, and the errors are those of the timed calls. Other
@@ -21,16 +21,17 @@ import numpy as np
 
 from lag_envs.report.general_results import CERTIFIED_ORDERS, DT, MEMBERS, MODES, content
 from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
-from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
-from lag_envs.report.reference import ends
-from lag_envs.report.rivals import Compiled, Rival
-from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.reference import exact_ends
+from lag_envs.report.rivals import CompiledMethod, Rival
+from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.timing import Sample, interleaved
-from lag_envs.stepping.general import code_of
+from lag_envs.scenes.derivation import order_of
+from lag_envs.stepping.general import series_code_of
 
-__all__ = ["certified", "content", "errors", "jobs", "measured", "shares"]
+__all__ = ["attempts_and_bounds", "content", "jobs", "shares", "timed_rivals", "worst_and_median"]
 
 SECTION = "general"
 #: Copies of the states in a timed call; our tolerances and orders.
@@ -67,30 +68,32 @@ print(process_time() - begin)
 # --- jobs ---
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: exact end states, equality of models, then everything that is timed."""
     names = ["cart-pole"] if quick else list(SYSTEMS)
     families = [f for f in FAMILIES if not (quick and f == "pinocchio")]
     count = 8 if quick else MEMBERS
     made = [
-        Job(SECTION, f"exact: {name}", f"{SECTION}:exact", {"name": name, "count": count}, 900.0)
+        ReportJob(SECTION, f"exact: {name}", f"{SECTION}:exact", {"name": name, "count": count}, 900.0)
         for name in names
     ]
     made += [
-        Job(SECTION, f"model: {name}, {engine}", f"{SECTION}:models", {"name": name, "engine": engine}, 600.0)
+        ReportJob(
+            SECTION, f"model: {name}, {engine}", f"{SECTION}:models", {"name": name, "engine": engine}, 600.0
+        )
         for name in names
         for engine in ENGINES
         if engine in families
     ]
     made += [
-        Job(
+        ReportJob(
             SECTION, f"certificate: {name}", f"{SECTION}:certificate",
             {"name": name, "count": count if quick else 1000}, 300.0,
         )
         for name in names
     ]  # fmt: skip
-    made.append(Job(SECTION, "energy", f"{SECTION}:energy", {"quick": quick}, 600.0))
-    alone = partial(Job, SECTION, timeout=900.0, alone=True)
+    made.append(ReportJob(SECTION, "energy", f"{SECTION}:energy", {"quick": quick}, 600.0))
+    alone = partial(ReportJob, SECTION, timeout=900.0, alone=True)
     made += [
         alone(f"{family}: {name}", f"{SECTION}:points", {"name": name, "family": family, "quick": quick})
         for name in names
@@ -103,10 +106,10 @@ def jobs(quick: bool) -> list[Job]:
     return made
 
 
-def exact(name: str, count: int) -> Iterator[Row]:
+def exact_ends_of_systems(name: str, count: int) -> Iterator[Row]:
     """Compute the exact end states, which are kept for the other jobs."""
     system = SYSTEMS[name]
-    high, _ = ends(system.scene, *system.draw(count), DT)
+    high, _ = exact_ends(system.scene, *system.draw(count), DT)
     yield {"kind": "exact", "system": name, "states": len(high)}
 
 
@@ -116,7 +119,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
     try:
         mass, acceleration = differences(SYSTEMS[name], engine)
     except ImportError as error:
-        yield about | {"problem": describe(error)}
+        yield about | {"problem": error_line(error)}
     else:
         yield about | {"mass": mass, "acceleration": acceleration}
 
@@ -124,8 +127,8 @@ def models(name: str, engine: str) -> Iterator[Row]:
 # --- error against time ---
 
 
-def rivals(family: str, quick: bool) -> list[Rival]:
-    """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
+def system_rivals(family: str, quick: bool) -> list[Rival]:
+    """Return a family's methods at all settings; lag_envs is among the compiled ones."""
     some: slice = slice(-1, None, -5) if quick else slice(None)
     if family == "heyoka":
         methods = ("Taylor",) if quick else ("Taylor", Heyoka.NARROW)
@@ -133,36 +136,36 @@ def rivals(family: str, quick: bool) -> list[Rival]:
     if family in ENGINES:
         kind = ENGINES[family]
         return [kind(method, n) for method, found in kind.settings.items() for n in found[some]]
-    ours = [
-        Certified(Certified.method_of(order), tolerance)
+    certified_series = [
+        CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
         for tolerance in TOLERANCES[some]
         for order in ORDERS[some]
     ]
-    others = [Compiled(method, n) for method in ("RK4", "DOP853") for n in SUBSTEPS[method][some]]
+    others = [CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in SUBSTEPS[method][some]]
     return [
-        *ours,
+        *certified_series,
         *others,
         *(CompiledRadau(CompiledRadau.METHOD, n) for n in SUBSTEPS[CompiledRadau.METHOD][some]),
     ]
 
 
-def points(name: str, family: str, quick: bool) -> Iterator[Row]:
+def system_points(name: str, family: str, quick: bool) -> Iterator[Row]:
     """Yield worst error and time of a family's settings on a system, alone and in a batch."""
     system, count = SYSTEMS[name], 8 if quick else MEMBERS
     starts, controls = system.draw(count)
-    truth = ends(system.scene, starts, controls, DT)
+    truth = exact_ends(system.scene, starts, controls, DT)
     copies = 1 if family in ENGINES else COPIES
     problems = SceneProblems(
         system.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)), system
     )
-    clock = Certified(Certified.method_of(CLOCK[1]), CLOCK[0])
+    clock = CertifiedSeries(CertifiedSeries.method_of(CLOCK[1]), CLOCK[0])
     for mode in MODES:
-        yield from measured(
-            problems, truth, rivals(family, quick), clock, mode, 3 if quick else 9, {"system": name}
+        yield from timed_rivals(
+            problems, truth, system_rivals(family, quick), clock, mode, 3 if quick else 9, {"system": name}
         )
 
 
-def measured(
+def timed_rivals(
     problems: SceneProblems,
     truth: tuple[Array, Array],
     some: Sequence[Rival],
@@ -185,9 +188,9 @@ def measured(
         }  # fmt: skip
         try:
             sample = rival.build(problems, dt, 1, together)
-            worst, typical = errors(sample.end(), truth)
+            worst, typical = worst_and_median(sample.end(), truth)
         except Exception as error:
-            yield row | {"problem": describe(error)}
+            yield row | {"problem": error_line(error)}
             if isinstance(error, ImportError):
                 return
         else:
@@ -199,7 +202,7 @@ def measured(
         yield row | {"ns": times[i + 1], "clock": times[0]}
 
 
-def errors(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:
+def worst_and_median(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:
     """Return the worst and median error over states, of the largest entry relative to max(1, |entry|)."""
     high, low = truth
     some = found[: len(high)]
@@ -210,7 +213,7 @@ def errors(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, floa
 
 
 def again(sample: Sample, least: int = 10_000) -> Sample:
-    """Return a quick sample, repeated from its start until it has at least so many steps."""
+    """Return a quick sample, repeated from its start until it has at least this many steps."""
     sample.end()
     begin = process_time()
     sample.end()
@@ -233,13 +236,15 @@ def certificate(name: str, count: int) -> Iterator[Row]:
     system = SYSTEMS[name]
     for dt in LENGTHS:
         for order in CERTIFIED_ORDERS:
-            attempts = certified(system.scene, *system.draw(count, seed=2), dt, order)[0]
+            attempts = attempts_and_bounds(system.scene, *system.draw(count, seed=2), dt, order)[0]
             yield {"kind": "certificate", "system": name, "dt": dt, "order": order, **shares(attempts)}
 
 
-def certified(scene: Any, states: Array, controls: Array, dt: float, order: int) -> tuple[list[int], Array]:
+def attempts_and_bounds(
+    scene: Any, states: Array, controls: Array, dt: float, order: int
+) -> tuple[list[int], Array]:
     """Return each step's attempts, not positive if it was refused, and the largest bound of any step."""
-    code, numbers = code_of(scene)
+    code, numbers = series_code_of(scene)
     attempts, bounds = [], []
     for state, held in zip(states.tolist(), controls.tolist(), strict=True):
         status, found = code.bounded(state, held, dt, order, numbers)
@@ -258,8 +263,8 @@ def shares(attempts: Sequence[int]) -> Row:
     }
 
 
-def first(name: str, rounds: int) -> Iterator[Row]:
-    """Yield the seconds until the first step: ours with an empty and a filled cache, heyoka's compilation."""
+def first_step_seconds(name: str, rounds: int) -> Iterator[Row]:
+    """Yield the seconds until the first step: with an empty and a filled cache, and heyoka's."""
     system = SYSTEMS[name]
     state, control = (x[0].tolist() for x in system.draw(1))
     script = FIRST.format(scene=system.scene, state=state, control=control, dt=DT)
@@ -280,7 +285,7 @@ def first(name: str, rounds: int) -> Iterator[Row]:
                 "seconds": _heyoka(system, mode),
             }
         except ImportError as error:
-            yield {"kind": "first", "system": name, "what": f"heyoka, {mode}", "problem": describe(error)}
+            yield {"kind": "first", "system": name, "what": f"heyoka, {mode}", "problem": error_line(error)}
             return
 
 
@@ -296,7 +301,7 @@ def _heyoka(system: System, mode: str) -> float:
     switch(False)
     try:
         begin = process_time()
-        Heyoka("Taylor", 1e-15)._integrator(problems.equation, width)
+        Heyoka("Taylor", 1e-15).integrator(problems.equation, width)
         return process_time() - begin
     finally:
         switch(True)
@@ -305,7 +310,7 @@ def _heyoka(system: System, mode: str) -> float:
 def energy(quick: bool) -> Iterator[Row]:
     """Yield how far the energy of undamped double pendulums drifts, relative to its range.
 
-    Ours over the whole path, the others at the end.
+    lag_envs over the whole path, the others at the end.
     """
     scene = SYSTEMS["double pendulum, driven"].scene
     count, steps = (1, 500) if quick else (4, round(LONG / DT))
@@ -326,7 +331,7 @@ def energy(quick: bool) -> Iterator[Row]:
         yield {"kind": "energy", "method": method, "seconds": steps * DT, "drift": worst}
     problems = SceneProblems(scene, starts, controls)
     for method, n in (("RK4", 4), ("RK4", 32), ("DOP853", 2), ("DOP853", 8)):
-        end = Compiled(method, n).build(problems, DT, steps, False).end()
+        end = CompiledMethod(method, n).build(problems, DT, steps, False).end()
         drift = np.abs(scene.energy(end)["total"] - before) / size
         row = {"kind": "energy", "method": f"{method}, {n} substeps", "seconds": steps * DT}
         yield row | {"drift": float(drift.max()) if np.isfinite(drift).all() else None}
@@ -336,9 +341,9 @@ def _path(scene: Any, start: Array, steps: int, tolerance: float | None) -> Arra
     """Return a trajectory without control, certified to a tolerance."""
     if tolerance is None:
         return scene.simulate(start, np.zeros(steps), DT)
-    code, numbers = code_of(scene)
+    code, numbers = series_code_of(scene)
     path = np.empty((steps + 1, len(start)))
     path[0] = start
-    if code.compile_simulate(tolerance)(path, np.zeros((steps, 1)), DT, float(scene._order(DT)), *numbers):
+    if code.compile_simulate(tolerance)(path, np.zeros((steps, 1)), DT, float(order_of(scene, DT)), *numbers):
         raise ArithmeticError("a step was refused")
     return path

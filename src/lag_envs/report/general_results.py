@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.linkages import SYSTEMS
-from lag_envs.report.motions import Certified
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.motions import CertifiedSeries
+from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.series import TOLERANCE
 
@@ -32,23 +32,23 @@ LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "com
 EQUAL, DRIFT = 1e-12, 1e-9
 
 
-class Best(NamedTuple):
+class BestSetting(NamedTuple):
     """A method's quickest setting that reaches an error."""
 
     ns: float
     label: str
 
 
-def label(row: Row) -> str:
+def setting_label(row: Row) -> str:
     """Return a setting in words."""
-    if row["family"] in ("ours", "heyoka"):
+    if row["family"] in ("lag_envs", "heyoka"):
         return f"{row['method'].removeprefix('lag_envs, ')}, {row['setting']:g}"
     return f"{row['method']}, {row['setting']:g} substep{'s' if row['setting'] > 1 else ''}"
 
 
-def column(row: Row) -> str:
+def column_name(row: Row) -> str:
     """Return a point's column: compiled methods have one each."""
-    if row["family"] == "ours":
+    if row["family"] == "lag_envs":
         return "lag_envs"
     if row["family"] == "compiled":
         return f"{row['method']}, compiled"
@@ -59,25 +59,25 @@ def column(row: Row) -> str:
 OTHERS = (
     ("other libraries", ("heyoka", "MuJoCo", "Pinocchio")),
     (
-        "fixed-step methods without a bound, compiled like ours",
+        "fixed-step methods without a bound, compiled like lag_envs",
         ("RK4, compiled", "DOP853, compiled", "Radau IIA, compiled"),
     ),
 )
 COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
 
 
-def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
+def best_settings(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, BestSetting]]:
     """Return, by system, mode and error, the quickest setting of each column.
 
-    Times are in units of ours in one job, by the clock of every job. A method without a batch counts there as
-    it does alone.
+    Times are in units of lag_envs's in one job, by the clock of every job. A method without a batch counts
+    there as it does alone.
     """
     points = [r for r in rows if r["kind"] == "point" and "ns" in r and r["error"] is not None]
     clocks: dict[tuple[str, str], float] = {}
     for r in points:
-        if r["family"] == "ours":
+        if r["family"] == "lag_envs":
             clocks.setdefault((r["system"], r["mode"]), r["clock"])
-    found: dict[tuple[str, str, float], dict[str, Best]] = {}
+    found: dict[tuple[str, str, float], dict[str, BestSetting]] = {}
     for r in points:
         ns = r["ns"] * clocks.get((r["system"], r["mode"]), r["clock"]) / r["clock"]
         for mode in MODES:
@@ -85,29 +85,29 @@ def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
                 continue
             for target in TARGETS:
                 here = found.setdefault((r["system"], mode, target), {})
-                if r["error"] <= target and not (column(r) in here and here[column(r)].ns <= ns):
-                    here[column(r)] = Best(ns, label(r))
+                if r["error"] <= target and not (column_name(r) in here and here[column_name(r)].ns <= ns):
+                    here[column_name(r)] = BestSetting(ns, setting_label(r))
     return found
 
 
-def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
+def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content: times at equal errors, equality of models, certificates, first steps, energy."""
-    found = best(rows)
+    found = best_settings(rows)
     missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
     fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
     claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
     pictures = [
-        Picture(
-            f"general-{slug(name)}",
+        ReportFigure(
+            f"general-{file_part(name)}",
             f"Error against time, {name}. One control step of {DT:g} s from {MEMBERS} harsh states: worst "
             "error, and CPU time of a state's step; reference: Lagrange's equations by SymPy, Taylor "
             "series in python-flint's balls.",
-            partial(draw, name, [r for r in rows if r["kind"] == "point" and r["system"] == name]),
+            partial(draw_times, name, [r for r in rows if r["kind"] == "point" and r["system"] == name]),
         )
         for name in SYSTEMS
         if any(r["kind"] == "point" and r["system"] == name for r in rows)
     ]
-    tables = [times(found, mode) for mode in MODES]
+    tables = [best_times(found, mode) for mode in MODES]
     tables += [_models(rows), _shares(rows), _first(rows), _energy(rows)]
     return Content(
         "Any Lagrangian",
@@ -121,13 +121,13 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
             "compilation does not. Samples are taken in turn, and times are medians of processor time. The "
             "errors are those of the timed calls, at the fastest setting that reaches the given "
             "error.",
-            "Ours certifies each step, at a tolerance and an order. The others give no bound: which "
+            "lag_envs certifies each step, at a tolerance and an order. The others give no bound: which "
             "setting reaches an error is known here only from the exact ends. heyoka runs with fast_math, "
             "without compact "
             "mode, its compiled step in a compiled loop, in a batch in blocks of two widths. MuJoCo runs its "
             "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
             "algorithm in RK4 steps in a C++ loop. For both, a driven support is a field in its frame. RK4, "
-            "DOP853 and Radau IIA take fixed steps and are compiled like ours.",
+            "DOP853 and Radau IIA take fixed steps and are compiled like lag_envs.",
             *([f"Not compared: {', '.join(missing)}."] if missing else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
@@ -139,12 +139,12 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     )
 
 
-def slug(name: str) -> str:
+def file_part(name: str) -> str:
     """Return a system's name as part of a file's."""
     return name.replace(",", "").replace(" ", "-")
 
 
-def verdict(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> str:
+def verdict(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> str:
     """Summarise for each column how it compares at equal error."""
     parts = []
     for name in COLUMNS:
@@ -165,45 +165,45 @@ def verdict(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> str:
     )
 
 
-def _cell(here: Mapping[str, Best], name: str) -> float | None:
+def _cell(here: Mapping[str, BestSetting], name: str) -> float | None:
     return round(here[name].ns, 1) if name in here else None
 
 
-def _others(here: Mapping[str, Best]) -> list[tuple[float, str]]:
+def _others(here: Mapping[str, BestSetting]) -> list[tuple[float, str]]:
     return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
 
 
-def times(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> Table:
+def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
     """Return the quickest setting of each column, by system and error."""
     rows = []
     for (system, of, target), here in found.items():
         if of != mode or "lag_envs" not in here:
             continue
-        others, ours = _others(here), here["lag_envs"]
-        ratio = others[0][0] / ours.ns if others else None
+        others, own = _others(here), here["lag_envs"]
+        ratio = others[0][0] / own.ns if others else None
         rows.append((
-            system, f"{target:g}", round(ours.ns, 1), ours.label, *(_cell(here, name) for name in COLUMNS),
+            system, f"{target:g}", round(own.ns, 1), own.label, *(_cell(here, name) for name in COLUMNS),
             ratio, f"{others[0][1]}: {here[others[0][1]].label}" if others else None,
         ))  # fmt: skip
     return Table(
         f"general-times-{mode}",
         f"CPU time of a control step [ns] {MODES[mode]}, each at its quickest setting whose worst error is "
-        "below the one given; the ratio is that of the quickest other to ours, below 1 where the other is "
-        "faster",
+        "below the one given; the ratio is that of the quickest other to lag_envs, below 1 where the other "
+        "is faster",
         (
             "system",
             "error",
             "lag_envs",
             "order, tolerance",
             *COLUMNS,
-            "quickest other / ours",
+            "quickest other / lag_envs",
             "quickest other",
         ),
         rows,
     )
 
 
-def _summary(found: Mapping[tuple, Mapping[str, Best]]) -> Table | None:
+def _summary(found: Mapping[tuple, Mapping[str, BestSetting]]) -> Table | None:
     rows = []
     for (system, mode, target), here in found.items():
         if mode == "single" and target in (1e-6, 1e-12) and "lag_envs" in here:
@@ -216,7 +216,7 @@ def _summary(found: Mapping[tuple, Mapping[str, Best]]) -> Table | None:
     return Table(
         "general-summary",
         f"Scenes defined by energies alone: CPU time of a control step of {DT:g} s [ns], each at its "
-        f"quickest setting whose worst error from {MEMBERS} harsh states is below the one given; ours is "
+        f"quickest setting whose worst error from {MEMBERS} harsh states is below the one given; lag_envs is "
         "certified, the others give no bound (`lag-envs report`)",
         ("system", "error", "lag_envs", "in a batch", *COLUMNS[:5], "heyoka in a batch"),
         rows,
@@ -234,7 +234,7 @@ def _equal(rows: Sequence[Row]) -> Claim:
 
 
 def _accurate(rows: Sequence[Row]) -> Claim:
-    shipped = TOLERANCE, Certified.method_of(usual_order(DT))
+    shipped = TOLERANCE, CertifiedSeries.method_of(usual_order(DT))
     found = [r for r in rows if r["kind"] == "point" and (r["setting"], r["method"]) == shipped]
     worst = max((math.inf if r["error"] is None else r["error"] for r in found), default=0.0)
     return Claim(
@@ -244,7 +244,9 @@ def _accurate(rows: Sequence[Row]) -> Claim:
     )
 
 
-def _fastest(found: Mapping[tuple, Mapping[str, Best]], mode: str, who: str, names: Sequence[str]) -> Claim:
+def _fastest(
+    found: Mapping[tuple, Mapping[str, BestSetting]], mode: str, who: str, names: Sequence[str]
+) -> Claim:
     lost, cases = [], 0
     for (system, of, target), here in found.items():
         others = [(ns, name) for ns, name in _others(here) if name in names]
@@ -256,7 +258,7 @@ def _fastest(found: Mapping[tuple, Mapping[str, Best]], mode: str, who: str, nam
             lost.append(f"{name} by {here['lag_envs'].ns / ns:.2f} ({system}, {target:g})")
     told = f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else "")
     return Claim(
-        f"Ours reaches each error in less time than {who}, {MODES[mode]}.",
+        f"lag_envs reaches each error in less time than {who}, {MODES[mode]}.",
         not lost if cases else None,
         told if cases else "",
     )
@@ -312,8 +314,8 @@ def _first(rows: Sequence[Row]) -> Table:
     kinds = ("cold", "cached", "heyoka, single", "heyoka, batch")
     return Table(
         "general-first",
-        "CPU seconds until the first step, without imports: ours from energies to a step, with an empty and "
-        "with a filled cache of compiled code; heyoka's compilation at tolerance 1e-15",
+        "CPU seconds until the first step, without imports: lag_envs from energies to a step, with an empty "
+        "and with a filled cache of compiled code; heyoka's compilation at tolerance 1e-15",
         ("system", "lag_envs, cold", "lag_envs, cached", "heyoka", "heyoka, batch"),
         [(name, *(median(of[k]) if k in of else None for k in kinds)) for name, of in found.items()],
     )
@@ -323,7 +325,7 @@ def _energy(rows: Sequence[Row]) -> Table:
     return Table(
         "general-energy",
         "Energy of undamped double pendulums: largest drift, relative to its height above the lowest "
-        "energy; ours over the whole time, the others at the end",
+        "energy; lag_envs over the whole time, the others at the end",
         ("method", "seconds", "drift"),
         [
             (r["method"], r["seconds"], "lost" if r["drift"] is None else r["drift"])
@@ -356,7 +358,7 @@ STYLES = {
 }
 
 
-def draw(name: str, rows: Sequence[Row]) -> Figure:
+def draw_times(name: str, rows: Sequence[Row]) -> Figure:
     """Draw worst errors against times: of each column the settings that none of its others beats."""
     from matplotlib.figure import Figure
 
@@ -372,7 +374,7 @@ def draw(name: str, rows: Sequence[Row]) -> Figure:
             some = [
                 (r["ns"], r["error"])
                 for r in rows
-                if column(r) == title
+                if column_name(r) == title
                 and (r["mode"] == mode or not r["batched"])
                 and r.get("error") is not None
             ]

@@ -1,4 +1,4 @@
-"""Gymnasium's environments of the same kind as ours: scenes with their equations, and their episodes.
+"""Gymnasium's counterparts of this package's environments: scenes with their equations, and episodes.
 
 A test checks on Gymnasium's own steps that the scenes have the equations of its source.
 """
@@ -13,14 +13,21 @@ import gymnasium as gym
 import numpy as np
 from mpmath import mpf
 
-from lag_envs.report.episodes import DIGITS, Episode, compare, entries, moved, random_actions
+from lag_envs.report.episodes import (
+    DIGITS,
+    RecordedEpisode,
+    endless_actions,
+    entry_errors,
+    episode_errors,
+    moved_start,
+)
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Row
 from lag_envs.scenes import Acrobot, CartPole, Pendulum
 from lag_envs.scenes.base import Scene
 
 
-class Peer(NamedTuple):
+class GymnasiumPeer(NamedTuple):
     """One of Gymnasium's environments: its equations, and the meaning of its actions."""
 
     scene: Callable[[Any], Scene]  #: from an instance
@@ -38,7 +45,7 @@ class Peer(NamedTuple):
 
 
 PEERS = {
-    "Pendulum-v1": Peer(
+    "Pendulum-v1": GymnasiumPeer(
         lambda env: Pendulum(mass=env.m, length=env.l, gravity=env.g),
         (0, 1),
         "semi-implicit Euler",
@@ -46,7 +53,7 @@ PEERS = {
         lambda env, action: float(np.clip(action, -env.max_torque, env.max_torque)[0]),
         limits=lambda env: [env.max_speed],
     ),
-    "CartPole-v1": Peer(
+    "CartPole-v1": GymnasiumPeer(
         lambda env: CartPole(
             cart_mass=env.masscart, pole_mass=env.masspole, half_length=env.length, gravity=env.gravity
         ),
@@ -55,7 +62,7 @@ PEERS = {
         lambda env: env.tau,
         lambda env, action: env.force_mag if action == 1 else -env.force_mag,
     ),
-    "Acrobot-v1": Peer(
+    "Acrobot-v1": GymnasiumPeer(
         lambda env: Acrobot(
             mass_1=env.LINK_MASS_1, mass_2=env.LINK_MASS_2, length_1=env.LINK_LENGTH_1,
             length_2=env.LINK_LENGTH_2, com_distance_1=env.LINK_COM_POS_1, com_distance_2=env.LINK_COM_POS_2,
@@ -71,8 +78,10 @@ PEERS = {
 }  # fmt: skip
 
 
-def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: bool) -> Episode:
-    """Record at most so many steps of a peer that has been reset; until its termination, or past it."""
+def record_peer(
+    env: Any, peer: GymnasiumPeer, actions: Iterator[Any], steps: int, to_the_end: bool
+) -> RecordedEpisode:
+    """Record at most this many steps of a peer that has been reset; until its termination, or past it."""
     states, controls, terminated = [np.array(env.state, np.float64)], [], False
     for action in itertools.islice(actions, steps):
         controls.append(peer.control(env, action))
@@ -81,37 +90,41 @@ def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: 
         terminated = terminated or bool(over)
         if terminated and to_the_end:
             break
-    return Episode(np.array(states), controls, terminated)
+    return RecordedEpisode(np.array(states), controls, terminated)
 
 
-def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, Episode, int]:
+def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, RecordedEpisode, int]:
     """Return a peer, an episode of it, and its seed: a later one if a speed was clipped with that seed."""
     peer = PEERS[id]
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     while True:
         env.reset(seed=seed)
-        episode = watch(env, peer, random_actions(env, seed), steps, to_the_end)
+        episode = record_peer(env, peer, endless_actions(env, seed), steps, to_the_end)
         limits = peer.limits(env)
         if not limits or (np.abs(episode.states[:, -len(limits) :]) < limits).all():
             return env, episode, seed
         seed += 1000
 
 
-def measure(env: Any, peer: Peer, episode: Episode) -> Row:
+def measure_peer(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row:
     """Return the row of a peer's episode against the exact one."""
     dt = peer.step(env)
-    path = solve(env, peer, episode.states[0], episode.controls)
-    shifted = solve(env, peer, moved(episode.states), episode.controls)
-    alone = [solve(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)]
-    row = compare(episode, path, shifted, alone, dt, peer.wraps)
+    path = solve_peer(env, peer, episode.states[0], episode.controls)
+    shifted = solve_peer(env, peer, moved_start(episode.states), episode.controls)
+    alone = [
+        solve_peer(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)
+    ]
+    row = episode_errors(episode, path, shifted, alone, dt, peer.wraps)
     return row | {
-        "ours": False,
+        "own": False,
         "integrator": peer.integrator,
-        "entries": entries(row.pop("each"), *peer.described(env)),
+        "entries": entry_errors(row.pop("each"), *peer.described(env)),
     }
 
 
-def solve(env: Any, peer: Peer, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
+def solve_peer(
+    env: Any, peer: GymnasiumPeer, start: Sequence[Any], controls: Sequence[float]
+) -> list[list[mpf]]:
     """Return the exact states of a peer's equations of motion, each control held for one step."""
     oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
     path = [[x if isinstance(x, mpf) else mpf(float(x)) for x in (start[i] for i in peer.order)]]

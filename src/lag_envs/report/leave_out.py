@@ -11,13 +11,14 @@ import numpy as np
 from lag_envs import TASKS
 from lag_envs.envs.program import Program, constants_of
 from lag_envs.report.cases import Case
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import plain_series
-from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.timing import Kernels, at_once, interleaved
+from lag_envs.report.timing import FlowSteps, at_once, interleaved
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.tasks.base import Task
 
@@ -28,8 +29,8 @@ SECTION = "leave_out"
 BATCH = 1024
 
 
-class Pair(NamedTuple):
-    """A scene without something, and the same one with it; a control step of both, from the same state."""
+class ScenePair(NamedTuple):
+    """A scene without a feature and with it, and a control step of both from the same state."""
 
     left_out: str
     without: Scene | Stepped
@@ -47,23 +48,23 @@ class Pair(NamedTuple):
 
 _FREE = PivotedBar(track=None, damping=0.001)
 PAIRS = (
-    Pair("drag of the bar", PivotedBar(track=None), _FREE),
-    Pair("support in the bar's state (track=None)", _FREE, PivotedBar(damping=0.001)),
-    Pair("gravity of the bar", PivotedBar(track=None, damping=0.001, gravity=0.0), _FREE),
-    Pair("orders 15 to 20 of the bar's series", _FREE, Stepped(_FREE, pendulum_flow(20))),
-    Pair("test of the certificate (never left out)", Stepped(_FREE, plain_series(14)), _FREE),
-    Pair("drag in a turning shell", CylinderInCylinder(), CylinderInCylinder(damping=0.024), 0.05),
-    Pair(
+    ScenePair("drag of the bar", PivotedBar(track=None), _FREE),
+    ScenePair("support in the bar's state (track=None)", _FREE, PivotedBar(damping=0.001)),
+    ScenePair("gravity of the bar", PivotedBar(track=None, damping=0.001, gravity=0.0), _FREE),
+    ScenePair("orders 15 to 20 of the bar's series", _FREE, Stepped(_FREE, pendulum_flow(20))),
+    ScenePair("test of the certificate (never left out)", Stepped(_FREE, plain_series(14)), _FREE),
+    ScenePair("drag in a turning shell", CylinderInCylinder(), CylinderInCylinder(damping=0.024), 0.05),
+    ScenePair(
         "turning of the shell", CylinderInCylinder(control="damping"), CylinderInCylinder(damping=0.024), 0.05
     ),
-    Pair("drag on a slope", Incline(control="tilt"), Incline(control="tilt", damping=0.03), 0.05),
-    Pair(
+    ScenePair("drag on a slope", Incline(control="tilt"), Incline(control="tilt", damping=0.03), 0.05),
+    ScenePair(
         "drag on a moving slope",
         Incline(control="tilt_rate"),
         Incline(control="tilt_rate", damping=0.03),
         0.05,
     ),
-    Pair(
+    ScenePair(
         "motion of the slope: closed form for a series",
         Incline(damping=0.03, tilt=0.1),
         Incline(control="tilt_rate", damping=0.03),
@@ -73,12 +74,12 @@ PAIRS = (
 QUICK_PAIRS = 2
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: one that examines the compiled code of every id, one that measures times."""
     count = QUICK_PAIRS if quick else len(PAIRS)
     return [
-        Job(SECTION, "terms", f"{SECTION}:terms"),
-        Job(
+        ReportJob(SECTION, "terms", f"{SECTION}:terms"),
+        ReportJob(
             SECTION,
             "savings",
             f"{SECTION}:savings",
@@ -94,11 +95,11 @@ def jobs(quick: bool) -> list[Job]:
 def terms() -> Iterator[Row]:
     """Yield the contents of the compiled step of every environment with a dedicated flow."""
     for id, task in TASKS.items():
-        if task().scene._form is not None:
-            yield {"kind": "terms", "id": id} | carried(task())
+        if form_of(task().scene) is not None:
+            yield {"kind": "terms", "id": id} | carried_numbers(task())
 
 
-def carried(task: Task) -> Row:
+def carried_numbers(task: Task) -> Row:
     """Return state, terms, stages and constants of a task's compiled step, and those that nothing uses."""
     scene = task.scene
     numbers = constants_of(task)
@@ -122,11 +123,11 @@ def carried(task: Task) -> Row:
         "zero": sorted(absent),
         "operations": code.operations,
         "unused": [name.removeprefix("k_") for name in given if name not in needed],
-        "idle": [name for line in lines for name in made(line) if name not in needed],
+        "idle": [name for line in lines for name in assigned(line) if name not in needed],
     }
 
 
-def made(line: str) -> list[str]:
+def assigned(line: str) -> list[str]:
     """Return the names that a line of code assigns.
 
     Examples
@@ -150,8 +151,8 @@ def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
     """
     needed = set(results)
     for line in reversed(lines):
-        if needed & set(made(line)) or not made(line):
-            needed |= set(re.findall(r"[A-Za-z_]\w*", line.partition("=")[2] if made(line) else line))
+        if needed & set(assigned(line)) or not assigned(line):
+            needed |= set(re.findall(r"[A-Za-z_]\w*", line.partition("=")[2] if assigned(line) else line))
     return needed
 
 
@@ -163,7 +164,7 @@ def savings(count: int, rounds: int) -> Iterator[Row]:
             scene = stepped.scene
             state = tuple(0.1 * (i + 1) for i in range(len(scene.state_names)))
             cases = [Case(scene, state, 0.1)] * BATCH
-            samples[f"{pair.left_out}, {name}"] = at_once(Kernels(scene, stepped.flow), cases, 8, pair.dt)
+            samples[f"{pair.left_out}, {name}"] = at_once(FlowSteps(scene, stepped.flow), cases, 8, pair.dt)
     times = interleaved(samples, rounds)
     for pair in PAIRS[:count]:
         yield {
@@ -187,7 +188,7 @@ TEXT = (
 )
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     found = [row for row in rows if row["kind"] == "terms"]
     saved = [row for row in rows if row["kind"] == "savings"]
@@ -196,7 +197,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         text=TEXT,
         tables=[_terms(found), _savings(saved)],
         pictures=[
-            Picture(
+            ReportFigure(
                 "leave-out",
                 "Time of a control step without a feature, and the time that the feature would add. "
                 "Batches of 1,024.",

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from lag_envs.report import reference
 from lag_envs.report.equations import Problems
 from lag_envs.report.motions import SceneProblems
-from lag_envs.report.peers import Peer
+from lag_envs.report.peers import LibraryRival
 from lag_envs.report.timing import Sample
 from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 
 Array = NDArray[np.float64]
 #: Inertia about a rod's own axis where it has none: MuJoCo requires a positive one [kg m²].
@@ -83,14 +84,14 @@ class System:
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
         """Return harsh random states and controls, one row each; prescribed coordinates start at 0.
 
-        Every joint turns at up to its full speed, all of them at once.
+        All joints turn at once, each at up to its full speed.
         """
         rng = np.random.default_rng(seed)
         states = np.zeros((count, len(self.scene.state_names)))
         controls = np.zeros((count, 1))
-        free = self.scene._layout.free
+        free = layout_of(self.scene).free
         for j in range(count):
-            for i, entry in enumerate(self.scene._layout.state):
+            for i, entry in enumerate(layout_of(self.scene).state):
                 if entry.coordinate in free:
                     widths = self.places if entry.kind == "place" else self.speeds
                     states[j, i] = rng.uniform(-1, 1) * widths[free.index(entry.coordinate)]
@@ -163,7 +164,7 @@ SYSTEMS = {
 }
 
 
-class Engine(Peer):
+class Engine(LibraryRival):
     """A rival with its own model, made of a system's links."""
 
     @property

@@ -1,4 +1,4 @@
-"""Control steps of an energy-defined scene as problems for every rival; ours is one of them."""
+"""Control steps of an energy-defined scene as problems for every method, lag_envs included."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate, substitute
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.recording import control, parameter
+from lag_envs.mechanics.recording import control, parameter, parameter_values
 from lag_envs.report.equations import Equation, Problems
-from lag_envs.report.oracle import oracle_of, solve
+from lag_envs.report.oracle import oracle_of, solve_positive
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import BLOCK, Sample
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.stepping.compiling import compile_function
-from lag_envs.stepping.general import code_of
+from lag_envs.stepping.general import series_code_of, stepper_of
 
 if TYPE_CHECKING:
     from lag_envs.report.linkages import System
@@ -39,7 +40,7 @@ class SceneEquation(Equation):
 
     @cached_property
     def _motion(self) -> tuple[list[Expr], list[Expr]]:
-        given = {name: getattr(self.scene, name) for name in self.scene._numbers()}
+        given = parameter_values(self.scene)
         # Parameters that may be infinite, such as a track, are in no formula.
         numbers = {parameter(name): Expr.of(x) for name, x in given.items() if math.isfinite(x)}
         found = self.scene.mechanics
@@ -50,7 +51,7 @@ class SceneEquation(Equation):
     @property
     def size(self) -> int:  # type: ignore[override]
         """Two for each free coordinate."""
-        return 2 * len(self.scene._layout.free)
+        return 2 * len(layout_of(self.scene).free)
 
     @property
     def lifted(self) -> int:  # type: ignore[override]
@@ -60,7 +61,7 @@ class SceneEquation(Equation):
     @cached_property
     def needed(self) -> tuple[str, ...]:
         """The parameters: controls, and the starts of prescribed coordinates, ``s`` and ``s_dot``."""
-        layout = self.scene._layout
+        layout = layout_of(self.scene)
         symbols = {symbol for part in self._motion for expr in part for symbol in expr.symbols()}
         found = [name for name in layout.controls if control(name) in symbols]
         for p in layout.at("acceleration", "rate"):
@@ -78,7 +79,7 @@ class SceneEquation(Equation):
 
     def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
         """Return velocities and accelerations."""
-        layout, n = self.scene._layout, self.size // 2
+        layout, n = layout_of(self.scene), self.size // 2
         given = dict(zip(self.needed, p, strict=True))
         values: dict[Atom, Any] = {control(name): u for name, u in given.items() if name in layout.controls}
         values |= {place(name): y[i] for i, name in enumerate(layout.free)}
@@ -94,7 +95,7 @@ class SceneEquation(Equation):
         mass, force = self._motion
         found = evaluate([*mass, *force], values, xp)
         rows = [found[i * n : (i + 1) * n] for i in range(n)]
-        return *y[n : 2 * n], *solve(rows, found[n * n :])
+        return *y[n : 2 * n], *solve_positive(rows, found[n * n :])
 
 
 class SceneProblems(Problems):
@@ -116,7 +117,7 @@ class SceneProblems(Problems):
         self.scene, self.starts, self.controls, self.system = scene, starts, controls, system
         self.cases = []
         self.equation: SceneEquation = SceneEquation(scene)
-        layout = scene._layout
+        layout = layout_of(scene)
         zero = np.zeros(len(starts))
         held = dict(zip(layout.controls, controls.T, strict=True))
         self._q, self._v = oracle_of(scene).start(list(starts.T), list(controls.T), lambda x: zero + x)
@@ -134,15 +135,15 @@ class SceneProblems(Problems):
     def _shift(self, sign: float) -> None:
         """Convert w to velocities, if a rate is held, or back."""
         scene = self.scene
-        if scene._layout.at("rate"):
+        if layout_of(scene).at("rate"):
             shift = oracle_of(scene).shift(self._q, self._v, list(self.controls.T))
             self._v |= {
-                name: self._v[name] + sign * x for name, x in zip(scene._layout.free, shift, strict=True)
+                name: self._v[name] + sign * x for name, x in zip(layout_of(scene).free, shift, strict=True)
             }
 
     def states(self, y: Array, span: float) -> Array:
         """Return the scene's states, one per line, from unknowns after a time with the controls held."""
-        layout = self.scene._layout
+        layout = layout_of(self.scene)
         n = len(layout.free)
         q, v = dict(self._q), dict(self._v)
         try:
@@ -161,14 +162,14 @@ class SceneProblems(Problems):
             self._q, self._v = q, v
 
 
-class Certified(Rival):
+class CertifiedSeries(Rival):
     """The general engine at a tolerance and an order, each step certified, in its shipped loops.
 
     The setting is the tolerance; the method names the order. Alone it runs the loop of `Scene.simulate`, in a
     batch the block function of the vector environments, both over one control step from each state.
     """
 
-    family = "ours"
+    family = "lag_envs"
 
     @staticmethod
     def method_of(order: int) -> str:
@@ -184,11 +185,11 @@ class Certified(Rival):
         """Compile."""
         assert isinstance(problems, SceneProblems) and steps == 1
         scene = problems.scene
-        code, numbers = code_of(scene)
+        code, numbers = series_code_of(scene)
         starts, controls, count = problems.starts, problems.controls, len(problems)
         width, order = starts.shape[1], float(self.order)
         if not together:
-            alone = _alone(scene._stepper, code, self.setting)
+            alone = _alone(stepper_of(scene.mechanics), code, self.setting)
             ends = np.empty_like(starts)
 
             def run() -> None:
@@ -196,7 +197,7 @@ class Certified(Rival):
                     raise ArithmeticError("a step was refused")
 
             return Sample(run, count, ends=ends.copy)
-        batch = _batch(scene._stepper, code, self.setting)
+        batch = _batch(stepper_of(scene.mechanics), code, self.setting)
         blocks = -(-count // BLOCK)
         rows = width + controls.shape[1] + len(code.rows) + 1
         memory = np.zeros((blocks, rows, BLOCK))

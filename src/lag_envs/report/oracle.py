@@ -32,7 +32,7 @@ import sympy
 from mpmath import mp, mpf
 from numpy.typing import NDArray
 
-from lag_envs.report.formulas import Formulas, Series
+from lag_envs.report.formulas import FormulaSeries, OperationList
 from lag_envs.scenes import symbolic
 from lag_envs.scenes.base import Scene
 
@@ -64,7 +64,7 @@ class Rounded(Unresolved):
 # --- equations ----------------------------------------------------------------------------------------------
 
 
-class Names(NamedTuple):
+class SceneNames(NamedTuple):
     """A scene's coordinates, controls and state, as read from their names."""
 
     free: tuple[str, ...]
@@ -74,7 +74,7 @@ class Names(NamedTuple):
     state: Sequence[tuple[str, str]]  #: coordinate, and "place", "velocity" or "momentum"
 
 
-def names_of(scene: Scene) -> Names:
+def names_of(scene: Scene) -> SceneNames:
     """Return the names of a scene."""
     free, controls = tuple(scene.coordinates), tuple(scene.control_names)
     moved = {
@@ -91,10 +91,10 @@ def names_of(scene: Scene) -> Names:
             state.append((name.removesuffix("_dot"), "velocity"))
         else:  # w, or w_<name> if several coordinates have one
             state.append((name[2:] or free[0], "momentum"))
-    return Names(free, moved, controls, state)
+    return SceneNames(free, moved, controls, state)
 
 
-class Equations:
+class OracleEquations:
     """Lagrange's equations M a = f of all scenes that differ only in numbers.
 
     Parameters
@@ -135,34 +135,36 @@ class Equations:
         }
         self.force = [-e.xreplace(given) for e in found]
         self.inputs = [*self.q.values(), *self.v.values()]
-        self.formulas = Formulas([*self.mass, *self.force, *self.coupling], self.inputs, [*self.u.values()])
+        self.formulas = OperationList(
+            [*self.mass, *self.force, *self.coupling], self.inputs, [*self.u.values()]
+        )
 
     @cached_property
-    def residuals(self) -> Formulas:
+    def residuals(self) -> OperationList:
         """M a - f, and its rows of derivatives with respect to places, velocities and accelerations."""
         n = len(self.a)
         left = [sum((self.mass[i * n + j] * self.a[j] for j in range(n)), -self.force[i]) for i in range(n)]
         of = [[symbols[name] for name in self.names.free] for symbols in (self.q, self.v)]
         slopes = [e.diff(symbol) for e in left for symbol in (*of[0], *of[1], *self.a)]
-        return Formulas([*left, *slopes], [*self.inputs, *self.a], [*self.u.values()])
+        return OperationList([*left, *slopes], [*self.inputs, *self.a], [*self.u.values()])
 
     @cached_property
-    def damping(self) -> Formulas:
+    def damping(self) -> OperationList:
         """∂f/∂v."""
         drag = [f.diff(self.v[name]) for f in self.force for name in self.names.free]
-        return Formulas(drag, self.inputs, [*self.u.values()])
+        return OperationList(drag, self.inputs, [*self.u.values()])
 
 
-_known: dict[Any, Equations] = {}
+_known: dict[Any, OracleEquations] = {}
 
 
-def equations_of(scene: Scene) -> Equations:
+def equations_of(scene: Scene) -> OracleEquations:
     """Return a scene's equations, derived once for all scenes that differ only in numbers."""
-    numbers = tuple(scene._numbers())
+    numbers = symbolic.parameter_names(scene)
     fields = [f.name for f in dataclasses.fields(scene)]  # type: ignore[arg-type]
     key = type(scene), repr([(name, getattr(scene, name)) for name in fields if name not in numbers]), numbers
     if key not in _known:
-        _known[key] = Equations(scene)
+        _known[key] = OracleEquations(scene)
     return _known[key]
 
 
@@ -180,7 +182,7 @@ BALLS = SimpleNamespace(
 )
 
 
-def solve(rows: Sequence[Sequence], right: Sequence) -> list:
+def solve_positive(rows: Sequence[Sequence], right: Sequence) -> list:
     """Return the solution of a small positive system, by elimination on numbers of any kind."""
     n = len(right)
     table = [[*row, b] for row, b in zip(rows, right, strict=True)]
@@ -201,14 +203,14 @@ def _ball(x: Any) -> Any:
     return x if isinstance(x, flint.arb) else flint.arb(x if isinstance(x, mpf) else float(x))
 
 
-def number(ball: Any) -> mpf:
+def midpoint(ball: Any) -> mpf:
     """Return a ball's midpoint as an mpmath number, without rounding."""
     mantissa, exponent = ball.mid().man_exp()
     with mp.workprec(int(mantissa).bit_length() + 1):
         return mp.ldexp(mpf(int(mantissa)), int(exponent))
 
 
-class Plan(NamedTuple):
+class Precision(NamedTuple):
     """The precision of a computation."""
 
     digits: int  #: kept by each step, absolute and relative to places and velocities
@@ -230,7 +232,7 @@ class Plan(NamedTuple):
 
 
 def agreed(compute: Callable[[int], list[mpf]], digits: int) -> list[mpf]:
-    """Return a result with at least so many digits, once two such computations agree.
+    """Return a result with at least this many digits, once two such computations agree.
 
     Raises
     ------
@@ -279,7 +281,7 @@ class Oracle:
     def __init__(self, scene: Scene, numbers: Mapping[str, Any] = MappingProxyType({})) -> None:
         self.equations = equations_of(scene)
         self.names = self.equations.names
-        values = {name: getattr(scene, name) for name in scene._numbers()} | dict(numbers)
+        values = {name: getattr(scene, name) for name in symbolic.parameter_names(scene)} | dict(numbers)
         symbols = {symbol for e in (*self.equations.mass, *self.equations.force) for symbol in e.free_symbols}
         symbols |= {symbol for e in self.equations.coupling for symbol in e.free_symbols}
         self._values = {s: sympy.Rational(values[s.name]) for s in symbols if s.name in values}
@@ -289,8 +291,8 @@ class Oracle:
         """Return an expression with the scene's numbers inserted."""
         return expression.xreplace(self._values)
 
-    def _constants(self, formulas: Formulas, bits: int) -> list:
-        """Return the constants of formulas as balls with so many bits, or as floats for 0 bits."""
+    def _constants(self, formulas: OperationList, bits: int) -> list:
+        """Return the constants of formulas as balls with this many bits, or as floats for 0 bits."""
         key = id(formulas), bits
         if key not in self._bound:
             exact = [self.exactly(e) for e in formulas.constants]
@@ -335,7 +337,7 @@ class Oracle:
         """Return mass matrix and accelerations at a state without held rates, in floats."""
         mass, force, _ = self.terms(*self.start(state, controls, float), controls)
         matrix = np.array(mass, dtype=np.float64)
-        return matrix, np.array(solve(matrix.tolist(), force), dtype=np.float64)
+        return matrix, np.array(solve_positive(matrix.tolist(), force), dtype=np.float64)
 
     def start(self, state: Sequence, controls: Sequence, make: Callable) -> tuple[dict, dict]:
         """Return places and velocities of all coordinates; w replaces the velocity if a rate is held."""
@@ -355,7 +357,7 @@ class Oracle:
         """Return M⁻¹ G ṡ, by which w exceeds the velocities if rates ṡ are held."""
         mass, _, coupling = self.terms(q, v, u, xp, bits)
         rates = [v[name] for name in self.equations.rates]
-        return solve(mass, [sum(g * s for g, s in zip(row, rates, strict=True)) for row in coupling])
+        return solve_positive(mass, [sum(g * s for g, s in zip(row, rates, strict=True)) for row in coupling])
 
     # --- exact ---
 
@@ -388,18 +390,18 @@ class Oracle:
         return agreed(lambda working: self.once(state, controls, dt, working), digits)
 
     def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
-        """Return the end state from one computation whose steps keep so many digits."""
+        """Return the end state from one computation whose steps keep this many digits."""
         for what, given, names in (
             ("state", state, self.names.state),
-            ("controls", listed(controls), self.names.controls),
+            ("controls", control_list(controls), self.names.controls),
         ):
             if len(given) != len(names):
                 raise ValueError(f"{what} must have {len(names)} entries, got {len(given)}")
         for spare in SPARE:
-            plan = Plan(digits, spare)
+            plan = Precision(digits, spare)
             with flint.ctx.workprec(plan.bits):
                 try:
-                    return [number(x) for x in self._end(plan, state, controls, dt)]
+                    return [midpoint(x) for x in self._end(plan, state, controls, dt)]
                 except Rounded:
                     if spare == SPARE[-1]:
                         raise
@@ -407,8 +409,8 @@ class Oracle:
                     raise Unresolved(f"a singular point on the way: {error}") from error
         raise AssertionError(SPARE)
 
-    def _end(self, plan: Plan, state: Sequence, controls: Any, dt: Any) -> list:
-        u, left = [_ball(x) for x in listed(controls)], _ball(dt)
+    def _end(self, plan: Precision, state: Sequence, controls: Any, dt: Any) -> list:
+        u, left = [_ball(x) for x in control_list(controls)], _ball(dt)
         q, v = self.start([_ball(x) for x in state], u, flint.arb)
         v = self._shifted(plan, q, v, u, -1)
         h, again = left, FIRST_TRY
@@ -431,7 +433,7 @@ class Oracle:
         v = self._shifted(plan, q, v, u, 1)
         return [(q if kind == "place" else v)[name] for name, kind in self.names.state]
 
-    def _shifted(self, plan: Plan, q: dict, v: dict, u: Sequence, sign: int) -> dict:
+    def _shifted(self, plan: Precision, q: dict, v: dict, u: Sequence, sign: int) -> dict:
         """Return velocities plus or minus the result of `shift`."""
         if not self.equations.rates:
             return v
@@ -462,25 +464,25 @@ class Oracle:
         digits : int
             Of the arithmetic.
         """
-        plan = Plan(digits)
+        plan = Precision(digits)
         with flint.ctx.workprec(plan.bits):
-            u = [_ball(x) for x in listed(controls)]
+            u = [_ball(x) for x in control_list(controls)]
             q, v = self.start([_ball(x) for x in state], u, flint.arb)
             v = self._shifted(plan, q, v, u, -1)
             grown = self._coefficients(plan, q, v, u, _ball(h))
             *_, found = itertools.islice(grown, max(1, count - 1))
-            places, rates = ({name: [number(c) for c in of[name][:count]] for name in of} for of in found)
+            places, rates = ({name: [midpoint(c) for c in of[name][:count]] for name in of} for of in found)
             return places, rates
 
     def _coefficients(
-        self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any
+        self, plan: Precision, q: dict, v: dict, u: Sequence, h: Any
     ) -> Iterator[tuple[dict[str, list], dict[str, list]]]:
         """Yield the coefficients of places and velocities, with time in units of h, one more each time."""
         free, n, zero = self.names.free, len(self.names.free), flint.arb(0)
         x, w = ({name: [value] for name, value in start.items()} for start in (q, v))
         formulas = self.equations.formulas
         inputs = [*x.values(), *w.values(), *([y] for y in u)]
-        series = Series(formulas, inputs, self._constants(formulas, plan.bits))
+        series = FormulaSeries(formulas, inputs, self._constants(formulas, plan.bits))
         mass, force = [series.found[i * n : (i + 1) * n] for i in range(n)], series.found[n * n :][:n]
         driven = {
             name: ([h * rate, h * h * push / 2], [h * push])
@@ -505,7 +507,7 @@ class Oracle:
                     coefficients[name].append(known[k] if k < len(known) else zero)
             yield x, w
 
-    def _series(self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict, Any]:
+    def _series(self, plan: Precision, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict, Any]:
         """Return places and velocities after a fraction of a time h, and that fraction."""
         free, part = self.names.free, flint.arb(1)
         limits = [plan.small(start[name]) for start in (q, v) for name in free]
@@ -540,7 +542,7 @@ class Oracle:
         mass = np.array(self.terms(q, v, held)[0], dtype=np.float64)
         return float(np.abs(np.linalg.solve(mass, drag.astype(np.float64))).sum(axis=1).max())
 
-    def _slow(self, plan: Plan, q: dict, v: dict, u: Sequence, left: Any) -> tuple[dict, dict] | None:
+    def _slow(self, plan: Precision, q: dict, v: dict, u: Sequence, left: Any) -> tuple[dict, dict] | None:
         """Return places and velocities after the time that is left, or None if they are not smooth."""
         h, shortest = left, left / 8
         while True:
@@ -556,7 +558,7 @@ class Oracle:
             left = (left - h).mid()
             h = left if left < 2 * h else 2 * h
 
-    def _collocated(self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict] | None:
+    def _collocated(self, plan: Precision, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict] | None:
         """Return places and velocities after a time h, from one polynomial for each acceleration."""
         free, n, arb_mat = self.names.free, len(self.names.free), flint.arb_mat
         formulas, nodes = self.equations.residuals, _nodes(plan.digits, plan.bits)
@@ -606,7 +608,7 @@ class Oracle:
         return q_end, v_end
 
 
-def listed(controls: Any) -> list:
+def control_list(controls: Any) -> list:
     """Return the controls as a list; a single control may be given as a number."""
     return list(controls) if isinstance(controls, Sequence | np.ndarray) else [controls]
 

@@ -1,4 +1,4 @@
-"""The first picture of docs/accuracy.md: error against run time, ours and the rivals'.
+"""The first picture of docs/accuracy.md: error against run time, of lag_envs and of its rivals.
 
 It is drawn from ``docs/accuracy.json`` alone, so it can be redrawn without measuring.
 """
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
 #: Columns of the general table that are not rivals, and the names of rivals in the picture.
 RIVALS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
-OURS = "lag_envs"
+LAG_ENVS = "lag_envs"
 Points = list[tuple[float, float]]
 
 
-def draw(accuracy: dict[str, Any]) -> Figure:
+def draw_overview(accuracy: dict[str, Any]) -> Figure:
     """Draw the picture.
 
     Parameters
@@ -43,7 +43,7 @@ def draw(accuracy: dict[str, Any]) -> Figure:
         for ax in (left, right)
         for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    first = f"{OURS}, with a proved bound"
+    first = f"{LAG_ENVS}, with a proved bound"
     names = [first, *sorted(set(shown) - {first})]
     figure.legend([shown[name] for name in names], names, loc="outside lower center", ncols=5, fontsize=8)
     left.annotate("lower left is better", (0.02, 0.03), xycoords="axes fraction", fontsize=8, color="#555555")
@@ -51,9 +51,9 @@ def draw(accuracy: dict[str, Any]) -> Figure:
 
 
 def own_step(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
-    """Return (time [ns], error) of ours and of the rivals that take less than 10 times as long."""
+    """Return (time [ns], error) of lag_envs and of the rivals that take less than 10 times as long."""
     (row,) = _rows(accuracy, "work_precision", "work_precision", scene=SCENE, mode=MODE)
-    ours = [(row["ns"], float(row["error"]))]
+    own_points = [(row["ns"], float(row["error"]))]
     rivals: dict[str, Points] = {}
     for near in _rows(accuracy, "work_precision", "work_precision_near", scene=SCENE, mode=MODE):
         name = near["rival"].removesuffix(", carried").removesuffix(" Taylor")
@@ -62,24 +62,24 @@ def own_step(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
                 rivals.setdefault(name, []).append((ratio * row["ns"], float(column[3:])))
     # The faster form of each.
     best = {name: _fastest(points) for name, points in rivals.items()}
-    return ours, {name: points for name, points in best.items() if len(points) > 1}
+    return own_points, {name: points for name, points in best.items() if len(points) > 1}
 
 
 def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
     """Return the same for a system that is stepped by the general series."""
-    ours: Points = []
+    own_points: Points = []
     rivals: dict[str, Points] = {}
     for row in _rows(accuracy, "general", "general-times-single", system=SYSTEM):
-        ours.append((row[OURS], float(row["error"])))
+        own_points.append((row[LAG_ENVS], float(row["error"])))
         for name in RIVALS:
             if row[name] is not None:
                 rivals.setdefault(name.removesuffix(", compiled"), []).append(
                     (row[name], float(row["error"]))
                 )
-    return ours, rivals
+    return own_points, rivals
 
 
-def findings(accuracy: dict[str, Any]) -> list[str]:
+def overview_sentences(accuracy: dict[str, Any]) -> list[str]:
     """Return sentences on how often a rival is faster at an error, and on the time of a general simulator."""
     own = list(_rows(accuracy, "work_precision", "work_precision_targets", horizon="one step"))
     modes = ("general-times-single", "general-times-batch")
@@ -88,7 +88,7 @@ def findings(accuracy: dict[str, Any]) -> list[str]:
     for error in dict.fromkeys(float(row["error"]) for row in systems):
         faster = [
             sum(row[ratio] is not None and row[ratio] < 1.0 for row in rows if float(row["error"]) == error)
-            for rows, ratio in ((own, "other / ours"), (systems, "quickest other / ours"))
+            for rows, ratio in ((own, "other / lag_envs"), (systems, "quickest other / lag_envs"))
         ]
         counts = [sum(float(row["error"]) == error for row in rows) for rows in (own, systems)]
         texts.append(
@@ -100,7 +100,7 @@ def findings(accuracy: dict[str, Any]) -> list[str]:
     if row["MuJoCo"] is not None:
         texts.append(
             f"A general simulator pays for its generality: at {_power(row['error'])} MuJoCo takes "
-            f"{row['MuJoCo'] / row[OURS]:,.0f} times as long as ours on the right."
+            f"{row['MuJoCo'] / row[LAG_ENVS]:,.0f} times as long as lag_envs on the right."
         )
     return texts
 
@@ -126,12 +126,18 @@ def _rows(accuracy: dict[str, Any], section: str, table: str, **wanted: str) -> 
             yield row
 
 
-def _panel(ax: Axes, title: str, ours: Points, rivals: dict[str, Points]) -> None:
+def _panel(ax: Axes, title: str, own_points: Points, rivals: dict[str, Points]) -> None:
     for name, points in rivals.items():
         known = STYLES.get(name) or STYLES.get(f"{name} Taylor") or STYLES.get(f"{name} RK4")
         colour, marker, line = known or ("#666666", "h", "--")
         ax.plot(*zip(*points, strict=True), marker + line, color=colour, markersize=5, label=name)
-    ax.plot(*zip(*ours, strict=True), "*-", color=DARK, markersize=13, label=f"{OURS}, with a proved bound")
+    ax.plot(
+        *zip(*own_points, strict=True),
+        "*-",
+        color=DARK,
+        markersize=13,
+        label=f"{LAG_ENVS}, with a proved bound",
+    )
     ax.set(xscale="log", yscale="log", xlabel="time of a control step [ns]", ylim=(2e-17, 3e-3))
     ax.set_title(title, fontsize=10)
     ax.grid(color="#e5e5e5")

@@ -22,16 +22,17 @@ from lag_envs import own_files
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.errors import UserError
 from lag_envs.report import general, general_results
-from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
+from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.oracle import Unresolved
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
-from lag_envs.report.reference import ends
-from lag_envs.report.rivals import Compiled, Rival
-from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.reference import exact_ends
+from lag_envs.report.rivals import CompiledMethod, Rival
+from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.scenes.derivation import order_of
 
 SECTION = "own"
 #: Numbers of states with exact ends, and of states for the certificate; then the same for a quick look.
@@ -72,7 +73,7 @@ class Subject(NamedTuple):
 
 
 def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
-    """Return the states of episodes under random actions, after so many steps or before their end."""
+    """Return the states of episodes under random actions, after this many steps or before their end."""
     env = LagrangianEnv(task)  # type: ignore[arg-type]
     env.action_space.seed(seed)
     states = []
@@ -99,15 +100,15 @@ def subjects(name: str) -> list[Subject]:
     UserError
         If there are none.
     """
-    path, kind = own_files.split(name)
+    path, kind = own_files.split_path(name)
     found, problems = [], []
     tasks, scenes = own_files.tasks(path), own_files.scenes(path)
     if kind and kind not in (*tasks, *scenes):
-        own_files.chosen(name)  # raises
+        own_files.chosen_tasks(name)  # raises
     used = {task.scene for task in tasks.values()}
     for label, task in tasks.items():
         if kind in ("", label):
-            found.append(_of_task(label, own_files.made(task, path)))
+            found.append(_of_task(label, own_files.made_with_defaults(task, path)))
     for label, scene in scenes.items():
         if kind == label or (not kind and scene not in used):
             try:
@@ -153,11 +154,11 @@ def subject(file: str, name: str) -> Subject:
 # --- jobs ---
 
 
-def jobs(quick: bool, file: str = "") -> list[Job]:
-    """Return the jobs: errors and certificate, stability, then all that is timed."""
+def jobs(quick: bool, file: str = "") -> list[ReportJob]:
+    """Return the jobs: errors and certificate, stability, then everything that is timed."""
     if not file:
         return []
-    path = Path(own_files.split(file)[0])
+    path = Path(own_files.split_path(file)[0])
     # Rows from another version of the file are not reused.
     about = {
         "file": str(path.resolve()) + file[len(str(path)) :],
@@ -166,7 +167,7 @@ def jobs(quick: bool, file: str = "") -> list[Job]:
     }
     names = [s.name for s in subjects(file)]
     return [
-        Job(
+        ReportJob(
             SECTION,
             f"{what}: {name}",
             f"{SECTION}:{what}",
@@ -179,19 +180,19 @@ def jobs(quick: bool, file: str = "") -> list[Job]:
     ]
 
 
-def steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
+def shipped_steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
     """Yield errors of steps as shipped beside their bounds, and the share certified as a whole."""
     s = subject(file, name)
-    order = s.scene._order(s.dt)
+    order = order_of(s.scene, s.dt)
     starts, controls = s.draw(SOME if quick else MANY, seed=1)
-    attempts, bounds = general.certified(s.scene, starts, controls, s.dt, order)
+    attempts, bounds = general.attempts_and_bounds(s.scene, starts, controls, s.dt, order)
     kept = bounds[np.array(attempts) > 0]
     yield {
         "kind": "certificate", "subject": name, "dt": s.dt, "order": order, "states": len(starts),
         **general.shares(attempts), "bound": float(kept.max()) if len(kept) else None,
     }  # fmt: skip
-    starts, controls, truth = exact(s, quick)
-    attempts, bounds = general.certified(s.scene, starts, controls, s.dt, order)
+    starts, controls, truth = exact_steps(s, quick)
+    attempts, bounds = general.attempts_and_bounds(s.scene, starts, controls, s.dt, order)
     for j, taken in enumerate(attempts):
         if taken <= 0:
             continue
@@ -203,13 +204,13 @@ def steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
         yield row | {"error": float((far / scale).max()), "beyond": float(((far - bounds[j]) / scale).max())}
 
 
-def exact(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Array]]:
+def exact_steps(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     """Return states, controls and the exact ends of their steps; singular ones are left out."""
     starts, controls = s.draw(FEW if quick else MEMBERS)
     kept, high, low = [], [], []
     for j in range(len(starts)):
         try:
-            a, b = ends(s.scene, starts[j : j + 1], controls[j : j + 1], s.dt)
+            a, b = exact_ends(s.scene, starts[j : j + 1], controls[j : j + 1], s.dt)
         except Unresolved:
             continue
         kept.append(j)
@@ -218,32 +219,36 @@ def exact(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     return starts[kept], controls[kept], (np.array(high), np.array(low))
 
 
-def points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
-    """Yield errors and times of ours and the usual integrators."""
+def step_points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
+    """Yield errors and times of lag_envs and the usual integrators."""
     s = subject(file, name)
-    starts, controls, truth = exact(s, quick)
+    starts, controls, truth = exact_steps(s, quick)
     if not len(starts):
         return
     copies = max(1, 1024 // len(starts))
     problems = SceneProblems(s.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)))
     some: slice = slice(-1, None, -3) if quick else slice(None)
-    ours: list[Rival] = [
-        Certified(Certified.method_of(order), tolerance)
+    compiled_here: list[Rival] = [
+        CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
         for tolerance in TOLERANCES[some]
         for order in ORDERS[some]
     ]
-    ours += [Compiled(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]]
-    ours += [CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]]
+    compiled_here += [
+        CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]
+    ]
+    compiled_here += [
+        CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]
+    ]
     others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
-    clock = Certified(Certified.method_of(16), 1e-12)
+    clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
     for mode in general_results.MODES:
-        for rivals in (ours, others):
-            yield from general.measured(
+        for rivals in (compiled_here, others):
+            yield from general.timed_rivals(
                 problems, truth, rivals, clock, mode, 3 if quick else 7, {"system": name}, s.dt
             )
 
 
-def cases(s: Subject) -> Iterator[tuple[str, Scene, float]]:
+def extreme_variants(s: Subject) -> Iterator[tuple[str, Scene, float]]:
     """Yield scenes with one extreme parameter each, if its range allows it, and a factor for the state."""
     yield "as it is", s.scene, 1.0
     yield f"states × {WILD:g}", s.scene, WILD
@@ -264,11 +269,11 @@ def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
     s = subject(file, name)
     count = 2 if quick else 20
     starts, controls = s.draw(count, seed=2)
-    for label, scene, factor in cases(s):
+    for label, scene, factor in extreme_variants(s):
         refused, worst = 0, 0.0
         for state, held in zip(starts, controls, strict=True):
             try:
-                found = balance(scene, factor * state, held, s.dt)
+                found = step_imbalance(scene, factor * state, held, s.dt)
             except StepRefused:
                 refused += 1
                 continue
@@ -277,7 +282,7 @@ def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
         yield about | {"balance": worst if math.isfinite(worst) else None}
 
 
-def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
+def step_imbalance(scene: Scene, start: Array, held: Array, dt: float) -> float:
     """Return the imbalance between a step's change of energy and its work, relative to energy and work.
 
     Work is a quadrature along the motion. If that is too coarse, the time is halved.
@@ -300,17 +305,17 @@ def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
 # --- results ---
 
 
-def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
+def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content."""
     names = list(dict.fromkeys(str(r.get("subject", r.get("system"))) for r in rows))
-    found, factors = general_results.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
+    found, factors = general_results.best_settings(rows), ", ".join(f"{f:g}" for f in FACTORS)
     pictures = [
-        Picture(
-            f"own-{general_results.slug(name)}",
+        ReportFigure(
+            f"own-{general_results.file_part(name)}",
             f"Error against time, {name}. One control step from {MEMBERS} states at most, {FEW} in a quick "
             "report: worst error, and CPU time of a state's step; reference: Taylor series of SymPy's "
             "equations in balls.",
-            partial(general_results.draw, name, some),
+            partial(general_results.draw_times, name, some),
         )
         for name in names
         if (some := [r for r in rows if r["kind"] == "point" and r["system"] == name and "ns" in r])
@@ -380,8 +385,8 @@ def _steps(rows: Sequence[Row]) -> Table:
     )
 
 
-def _times(found: Mapping[tuple, Mapping[str, general_results.Best]], mode: str) -> Table:
-    return dataclasses.replace(general_results.times(found, mode), name=f"own-times-{mode}")
+def _times(found: Mapping[tuple, Mapping[str, general_results.BestSetting]], mode: str) -> Table:
+    return dataclasses.replace(general_results.best_times(found, mode), name=f"own-times-{mode}")
 
 
 def _stability(rows: Sequence[Row]) -> Table:

@@ -9,12 +9,12 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lag_envs import store
-from lag_envs.report.content import Content, Picture, Table
+from lag_envs.report.content import Content, ReportFigure, Table
 
 VERDICTS = {True: "holds", False: "does not hold", None: "not measured"}
 
 
-def write(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> None:
+def write_report(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> None:
     """Write ``index.html``, ``figures/`` and ``tables/``.
 
     Parameters
@@ -32,17 +32,17 @@ def write(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> 
         for table in tables(content, details=True):
             write_csv(table, folder / "tables" / f"{table.name}.csv")
         for picture in content.pictures:
-            draw(picture, folder / "figures")
+            write_figure(picture, folder / "figures")
     environment = Environment(
         loader=PackageLoader("lag_envs.report"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"cell": cell, "is_number": lambda x: isinstance(x, int | float)}
+    environment.filters |= {"cell": cell_text, "is_number": lambda x: isinstance(x, int | float)}
     text = environment.get_template("page.html").render(
-        found=found, contents=contents, verdicts=VERDICTS, tables=tables, file_of=file_of,
+        found=found, contents=contents, verdicts=VERDICTS, tables=tables, file_of=figure_file,
         problems=[p for part in found["sections"].values() for p in part["problems"]],
     )  # fmt: skip
-    store.write(folder / "index.html", text)
+    store.write_file(folder / "index.html", text)
 
 
 def tables(content: Content, details: bool = False) -> list[Table]:
@@ -52,16 +52,16 @@ def tables(content: Content, details: bool = False) -> list[Table]:
     return list(unique.values())
 
 
-def file_of(picture: Picture) -> str:
+def figure_file(picture: ReportFigure) -> str:
     """Return the name of a figure's file."""
     return f"{picture.name}.{'png' if picture.raster else 'svg'}"
 
 
-def draw(picture: Picture, folder: Path) -> Path:
+def write_figure(picture: ReportFigure, folder: Path) -> Path:
     """Write a figure; the file depends only on the drawing."""
     import matplotlib
 
-    path = folder / file_of(picture)
+    path = folder / figure_file(picture)
     with matplotlib.rc_context({"svg.hashsalt": "lag_envs", "svg.fonttype": "none", "font.size": 9}):
         picture.draw().savefig(
             path, dpi=120, bbox_inches="tight", facecolor="white",
@@ -78,7 +78,7 @@ def write_csv(table: Table, path: Path) -> None:
         writer.writerows(table.rows)
 
 
-def cell(value: Any) -> str:
+def cell_text(value: Any) -> str:
     """Return a table's entry as text.
 
     Examples

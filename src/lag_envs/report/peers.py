@@ -27,7 +27,7 @@ TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 SUBSTEPS = (1, 4, 16, 64)
 
 
-class Peer(Rival):
+class LibraryRival(Rival):
     """A rival from another library."""
 
     #: The methods to measure, each with tolerances or substeps.
@@ -37,7 +37,7 @@ class Peer(Rival):
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Tell whether it can step a scene."""
+        """Return whether it can step a scene."""
         return True
 
     @property
@@ -49,7 +49,7 @@ class Peer(Rival):
 # --- SciPy ---
 
 
-class SciPy(Peer):
+class SciPy(LibraryRival):
     """SciPy's solvers with a compiled right-hand side.
 
     dopri5, dop853 and lsoda are those of `scipy.integrate.ode`, whose loops are compiled and take a tenth of
@@ -117,7 +117,7 @@ class SciPy(Peer):
         return solve
 
 
-def recorded(equation: Equation) -> tuple[list[str], list]:
+def rate_lines(equation: Equation) -> tuple[list[str], list]:
     """Return the lines of the rate of y0, y1, ... with p0, p1, ... at the time t, and its values."""
     trace = ElementaryTrace()
     names = [f"y{i}" for i in range(equation.size)], [f"p{i}" for i in range(equation.parameters)]
@@ -129,7 +129,7 @@ def recorded(equation: Equation) -> tuple[list[str], list]:
 @cache
 def _rate(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
-    lines, values = recorded(equation)
+    lines, values = rate_lines(equation)
     source = [
         "def rate(t, y, p):",
         *(f"y{i} = y[{i}]" for i in range(equation.size)),
@@ -145,7 +145,7 @@ def _rate(equation: Equation) -> Callable:
 @cache
 def _rate_of_many(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of many states, one after the other in y; p has a row for each parameter."""
-    lines, values = recorded(equation)
+    lines, values = rate_lines(equation)
     size = equation.size
     source = [
         "def rate(t, y, p):",
@@ -163,7 +163,7 @@ def _rate_of_many(equation: Equation) -> Callable:
 # --- heyoka ---
 
 
-class Heyoka(Peer):
+class Heyoka(LibraryRival):
     """heyoka's adaptive Taylor series, of an order chosen from the tolerance, with fast_math.
 
     For one step per control, its compiled step is called from a compiled loop, so that no call from Python
@@ -185,7 +185,7 @@ class Heyoka(Peer):
         import heyoka
 
         width = heyoka.recommended_simd_size() * (1 if self.method == self.NARROW else 2) if together else 1
-        integrator = self._integrator(problems.equation, width)
+        integrator = self.integrator(problems.equation, width)
         size, count, span = problems.equation.size, len(problems), dt * steps
         start, p = blocks(problems.y[:size], width), blocks(problems.p, width)
         rows = start.copy()
@@ -221,7 +221,8 @@ class Heyoka(Peer):
         integrator.propagate_until(span)
         block[:] = integrator.state.reshape(block.shape)
 
-    def _integrator(self, equation: Equation, width: int) -> Any:
+    def integrator(self, equation: Equation, width: int) -> Any:
+        """Compile heyoka's integrator for vectors of this width."""
         import heyoka
 
         names = heyoka.make_vars(*(f"y{i}" for i in range(equation.size)))
@@ -313,7 +314,7 @@ def _loop() -> Callable:
 # --- diffrax ---
 
 
-class Diffrax(Peer):
+class Diffrax(LibraryRival):
     """diffrax in one call compiled by XLA: a loop over single states, or a map over a batch.
 
     Its controller chooses each state's steps, or all steps have one length ("fixed").
@@ -383,7 +384,7 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
 # --- torchdiffeq ---
 
 
-class Torchdiffeq(Peer):
+class Torchdiffeq(LibraryRival):
     """torchdiffeq on tensors of all states, which share their steps; its loop over steps is in Python."""
 
     family = "torchdiffeq"
@@ -448,7 +449,7 @@ MODELS: dict[type[Scene], str] = {
 }
 
 
-class MuJoCo(Peer):
+class MuJoCo(LibraryRival):
     """MuJoCo's own dynamics in its compiled rollouts, one state after the other; it has no batch."""
 
     family = "mujoco"
@@ -457,7 +458,7 @@ class MuJoCo(Peer):
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Tell whether there is a model of the scene."""
+        """Return whether there is a model of the scene."""
         return any(kind in MODELS for kind in type(scene).__mro__)
 
     @property
@@ -502,4 +503,6 @@ class MuJoCo(Peer):
         return Sample(run, len(models) * steps, ends=lambda: ends[:, 1:].copy())
 
 
-PEERS: dict[str, type[Peer]] = {peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)}
+PEERS: dict[str, type[LibraryRival]] = {
+    peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)
+}

@@ -19,7 +19,7 @@ LIBRARIES = {
 }
 
 
-class Point(NamedTuple):
+class WorkPrecisionPoint(NamedTuple):
     """One method at one setting, in one form: its errors and its time."""
 
     variant: str
@@ -34,9 +34,9 @@ class Point(NamedTuple):
     ns: float
 
     @property
-    def ours(self) -> bool:
+    def own(self) -> bool:
         """Whether it is the shipped method."""
-        return self.family == "ours"
+        return self.family == "lag_envs"
 
     @property
     def diverged(self) -> int:
@@ -56,27 +56,29 @@ class Point(NamedTuple):
     @property
     def label(self) -> str:
         """The method and its setting in words."""
-        if self.ours and self.setting == 1:
+        if self.own and self.setting == 1:
             return self.method
-        if self.family in ("ours", "compiled", "mujoco") or self.method.endswith("fixed"):
+        if self.family in ("lag_envs", "compiled", "mujoco") or self.method.endswith("fixed"):
             if self.setting < 1.0:
                 return f"{self.name}, a step for {1.0 / self.setting:g}"
             return f"{self.name}, {self.setting:g} substep{'s' if self.setting > 1 else ''}"
         return f"{self.name}, {self.setting:g}"
 
 
-def gathered(rows: Sequence[Row]) -> list[Point]:
+def gathered(rows: Sequence[Row]) -> list[WorkPrecisionPoint]:
     """Return the points, with all times as on a machine of one speed.
 
-    Each job has timed ours in turn with its own samples, as its clock. Times are multiplied by the ratio of
-    the clock in our own job to that job's clock. A method without a batch counts there as it does alone.
+    Each job has timed lag_envs in turn with its own samples, as its clock. Times are multiplied by the ratio
+    of the clock in our own job to that job's clock. A method without a batch counts there as it does alone.
     """
     measured = [r for r in rows if r["kind"] == "point" and "problem" not in r]
-    clocks = {(r["variant"], r["horizon"], r["mode"]): r["clock"] for r in measured if r["family"] == "ours"}
+    clocks = {
+        (r["variant"], r["horizon"], r["mode"]): r["clock"] for r in measured if r["family"] == "lag_envs"
+    }
     found = []
     for row in measured:
         key = row["variant"], row["horizon"], row["mode"]
-        point = Point(
+        point = WorkPrecisionPoint(
             *key, row["family"], row["method"], row["setting"], row["error"], row["median"], row["errors"],
             row["ns"] * clocks.get(key, row["clock"]) / row["clock"],
         )  # fmt: skip

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from lag_envs.report.equations import Equation, Problems
-from lag_envs.report.peers import recorded
+from lag_envs.report.peers import rate_lines
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import Sample
 from lag_envs.stepping.compiling import compile_function
@@ -101,7 +101,7 @@ class CompiledRadau(Rival):
 @cache
 def _loop(equation: Equation) -> Callable:
     """Compile ``radau(starts, p, ends, a, n, h)``: n steps from each state, one after the other."""
-    lines, values = recorded(equation)
+    lines, values = rate_lines(equation)
     source = [
         "def rate(t, y, p, out):",
         *(f"y{i} = y[{i}]" for i in range(equation.size)),

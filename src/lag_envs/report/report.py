@@ -14,8 +14,8 @@ from typing import Any
 from lag_envs import store
 from lag_envs.host import machine
 from lag_envs.report.content import Content
-from lag_envs.report.runner import Result, module, run_jobs, versions
-from lag_envs.tables import columns
+from lag_envs.report.runner import JobResult, module, run_jobs, versions
+from lag_envs.tables import aligned
 
 #: Modules of this package, in the order of the page.
 SECTIONS = ("environments", "work_precision", "general", "bound", "stability", "conservation", "leave_out")
@@ -23,7 +23,7 @@ FILE = "report.json"
 
 
 @dataclass
-class Settings:
+class ReportSettings:
     """Extent and destination of a report."""
 
     folder: str = "report"
@@ -38,7 +38,7 @@ class NotAReport(ValueError):
     """The folder holds something else."""
 
 
-def make_report(settings: Settings) -> bool:
+def make_report(settings: ReportSettings) -> bool:
     """Measure what the folder lacks and write everything; return False if interrupted.
 
     Raises
@@ -53,13 +53,13 @@ def make_report(settings: Settings) -> bool:
     jobs = [job for name in settings.sections for job in module(name).jobs(*given)]
     begin = time.monotonic()
     results, complete = run_jobs(jobs, folder, settings.processes, lambda text: print(text, file=sys.stderr))
-    found = collect(settings, results, complete, time.monotonic() - begin)
-    store.write(folder / FILE, json.dumps(found, indent=1, allow_nan=False) + "\n")
+    found = collect_rows(settings, results, complete, time.monotonic() - begin)
+    store.write_file(folder / FILE, json.dumps(found, indent=1, allow_nan=False) + "\n")
     from lag_envs.report import page
 
     contents = content_of(found)
-    page.write(found, contents, folder)
-    print("\n".join(claims(contents)))
+    page.write_report(found, contents, folder)
+    print("\n".join(claim_lines(contents)))
     missing = len(jobs) - len(results)
     if missing:
         print(f"\ninterrupted: {missing} of {len(jobs)} jobs are missing; re-run the command to resume")
@@ -79,7 +79,9 @@ def prepare(folder: Path) -> Path:
     return folder
 
 
-def collect(settings: Settings, results: Sequence[Result], complete: bool, seconds: float) -> dict[str, Any]:
+def collect_rows(
+    settings: ReportSettings, results: Sequence[JobResult], complete: bool, seconds: float
+) -> dict[str, Any]:
     """Return all measurements, by section."""
     return {
         "complete": complete,
@@ -101,12 +103,12 @@ def collect(settings: Settings, results: Sequence[Result], complete: bool, secon
 def content_of(found: dict[str, Any]) -> dict[str, Content]:
     """Return each section's content."""
     return {
-        name: module(name).content(part["rows"], [Result(**problem) for problem in part["problems"]])
+        name: module(name).content(part["rows"], [JobResult(**problem) for problem in part["problems"]])
         for name, part in found["sections"].items()
     }
 
 
-def claims(contents: dict[str, Content]) -> list[str]:
+def claim_lines(contents: dict[str, Content]) -> list[str]:
     """Return a line per claim."""
     words = {True: "holds", False: "DOES NOT HOLD", None: "not measured"}
     rows = [
@@ -114,4 +116,4 @@ def claims(contents: dict[str, Content]) -> list[str]:
         for content in contents.values()
         for claim in content.claims
     ]
-    return columns(rows) if rows else ["nothing was measured"]
+    return aligned(rows) if rows else ["nothing was measured"]

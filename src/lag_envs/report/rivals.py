@@ -1,11 +1,11 @@
-"""The methods to compare: ours, and rivals of any kind behind one interface, each in its fastest form.
+"""The methods to compare: lag_envs, and rivals of any kind behind one interface, each in its fastest form.
 
 A `Rival` is built for some `Problems` and a time over which their controls are held. It then runs, and is
 timed, in one call for all of them over the whole time: in compiled loops if it has them, on blocks of states
 at once if it can take them, with its own choice of steps if it has one. Errors are those of the very calls
 that are timed.
 
-`Ours` and `Compiled` are compiled by our machinery; other libraries are in `peers`.
+`ShippedStepping` and `CompiledMethod` are compiled by our machinery; other libraries are in `peers`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lag_envs.report.arithmetic import Arithmetic
 from lag_envs.report.cases import Case
 from lag_envs.report.equations import Array, Equation, Problems
 from lag_envs.report.integrators import METHODS
-from lag_envs.report.timing import BLOCK, Kernels, Sample, at_once, one_by_one
+from lag_envs.report.timing import BLOCK, FlowSteps, Sample, at_once, one_by_one
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
@@ -38,7 +38,7 @@ class Rival(ABC):
         A tolerance, or for methods that are `fixed` the substeps per control step; 1/4 is one step for four.
     """
 
-    #: Where it comes from: a package's name, "compiled", or "ours".
+    #: Where it comes from: a package's name, "compiled", or "lag_envs".
     family: ClassVar[str]
 
     def __init__(self, method: str, setting: float) -> None:
@@ -95,13 +95,13 @@ class Rival(ABC):
         return max(1, round(self.setting * steps))
 
 
-class Ours(Rival):
+class ShippedStepping(Rival):
     """The shipped stepping: a scene's own flow, and no other order or tolerance.
 
     The setting is the number of steps per control step: for another accuracy, users choose another `dt`.
     """
 
-    family = "ours"
+    family = "lag_envs"
     METHOD = "lag_envs"  #: control step by control step, like an environment
     ONE_CALL = "lag_envs, one call"  #: the whole time as one step, which `simulate` divides by the bound
 
@@ -120,7 +120,7 @@ class Ours(Rival):
         cases = problems.cases
         count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
         length = dt * steps / count
-        kernels = Kernels(cases[0].scene, dt=length)
+        kernels = FlowSteps(cases[0].scene, dt=length)
         alike: dict[Scene, list[Case]] = {}
         for case in cases:
             alike.setdefault(case.scene, []).append(case)
@@ -147,8 +147,8 @@ class Ours(Rival):
         )
 
 
-class Compiled(Rival):
-    """An integrator of `METHODS`, compiled like ours: with the same recorder, compiler and vector width.
+class CompiledMethod(Rival):
+    """An integrator of `METHODS`, compiled like lag_envs: with the same recorder, compiler and vector width.
 
     Coefficients are precomputed, so that only the method is timed. Alone: one compiled loop over steps and
     trajectories. In a batch: one compiled loop over blocks of states.

@@ -25,7 +25,7 @@ import lag_envs
 from lag_envs import store
 from lag_envs.host import machine
 from lag_envs.progress import progress
-from lag_envs.workers import died, outcomes, processes
+from lag_envs.workers import as_they_finish, died, processes
 
 Row = dict[str, Any]
 #: Packages whose versions are recorded.
@@ -36,7 +36,7 @@ LIBRARIES = (
 
 
 @dataclass(frozen=True)
-class Job:
+class ReportJob:
     """A piece of work that takes seconds.
 
     ``function``, as "module:name" within this package or "package.module:name", is called with the arguments
@@ -58,7 +58,7 @@ class Job:
 
 
 @dataclass
-class Result:
+class JobResult:
     """A job's outcome."""
 
     section: str
@@ -90,8 +90,8 @@ def versions() -> dict[str, str]:
 
 
 def run_jobs(
-    jobs: Sequence[Job], folder: Path, processes: int, tell: Callable[[str], None] = lambda text: None
-) -> tuple[list[Result], bool]:
+    jobs: Sequence[ReportJob], folder: Path, processes: int, tell: Callable[[str], None] = lambda text: None
+) -> tuple[list[JobResult], bool]:
     """Run the jobs that have no result in the folder yet.
 
     Parameters
@@ -113,14 +113,14 @@ def run_jobs(
         False if the user interrupted it.
     """
     file = folder / "results.jsonl"
-    known = {result.key: result for result in load(file) if result.problem is None}
+    known = {result.key: result for result in load_results(file) if result.problem is None}
     todo = [job for job in jobs if job.key not in known]
     if len(todo) < len(jobs):
         tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are reused from before")
     complete = True
     with progress(len(todo)) as advance:
 
-        def keep(result: Result) -> None:
+        def keep(result: JobResult) -> None:
             known[result.key] = result
             store.append(file, vars(result))
             advance(f"{result.section}: {result.name}")
@@ -137,16 +137,16 @@ def run_jobs(
     return [known[job.key] for job in jobs if job.key in known], complete
 
 
-def load(file: Path) -> list[Result]:
+def load_results(file: Path) -> list[JobResult]:
     """Return the results in a file; a line that was cut off by a kill is skipped."""
     results = []
     for row in store.rows(file):
         with suppress(TypeError):
-            results.append(Result(**row))
+            results.append(JobResult(**row))
     return results
 
 
-def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterator[Result]:
+def _in_processes(jobs: Sequence[ReportJob], folder: Path, count: int) -> Iterator[JobResult]:
     with (
         TemporaryDirectory(dir=folder, prefix="rows-") as rows,
         processes(count, _begin, str(folder)) as submit,
@@ -155,13 +155,13 @@ def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterator[Res
         for job in jobs:
             arguments = (job.function, job.arguments, Path(rows) / job.key)
             futures[submit(_work, *arguments, timeout=job.timeout)] = job
-        for job, outcome in outcomes(futures):
+        for job, outcome in as_they_finish(futures):
             if isinstance(outcome, TimeoutError):
                 outcome = f"stopped after {job.timeout:.0f} s", job.timeout
             elif isinstance(outcome, BaseException):
                 outcome = died(outcome), 0.0
             # Including the rows from before it died.
-            yield Result(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
+            yield JobResult(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
 
 
 def _begin(folder: str) -> None:
@@ -182,7 +182,7 @@ def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | N
         for row in getattr(module(place), name)(**arguments):
             store.append(rows, row)
     except Exception as error:
-        problem = describe(error)
+        problem = error_line(error)
     return problem, round(time.monotonic() - start, 3)
 
 
@@ -191,7 +191,7 @@ def module(name: str) -> Any:
     return import_module(name if "." in name else f"lag_envs.report.{name}")
 
 
-def describe(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """Return an error as one line; for a missing package, that it is not installed.
 
     Examples

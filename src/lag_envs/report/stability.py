@@ -12,14 +12,14 @@ from lag_envs.report import extremes, reference
 from lag_envs.report.cases import Case, scales
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.integrators import comparison
-from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.stability_maps import MAPS
 from lag_envs.report.stability_results import (
     DIVERGED,
     FAR_OFF,
+    LAG_ENVS,
     MOST_SUBSTEPS,
     NO_REFERENCE,
-    OURS,
     PEERS,
     REFUSED,
     TOO_LONG,
@@ -27,16 +27,17 @@ from lag_envs.report.stability_results import (
 )
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.scenes.derivation import motion_constants_of
 
-__all__ = ["cases", "cells", "content", "jobs", "march", "methods", "outcomes"]
+__all__ = ["content", "extreme_errors", "jobs", "largest_errors", "map_errors", "methods", "step_cases"]
 
 SECTION = "stability"
 PRECISIONS: dict[str, type[np.floating]] = {"float64": np.float64, "float32": np.float32}
 
 
-def jobs(quick: bool) -> list[Job]:
+def jobs(quick: bool) -> list[ReportJob]:
     """Return the section's jobs: one for every row of a map, and the named cases."""
-    found: list[Job] = []
+    found: list[ReportJob] = []
     for title, map in MAPS.items():
         low, high = map.exponents
         values = _decades(low, high, 7 if quick else 2 * (high - low) + 1)
@@ -45,11 +46,13 @@ def jobs(quick: bool) -> list[Job]:
                 continue
             for dt in _decades(-6, 0, 5 if quick else 13):
                 arguments = {"map": title, "name": name, "dt": dt, "values": values}
-                found.append(Job(SECTION, f"{name}, {title}, step {dt:.2g} s", "stability:cells", arguments))
+                found.append(
+                    ReportJob(SECTION, f"{name}, {title}, step {dt:.2g} s", "stability:map_errors", arguments)
+                )
     cases = list(extremes.QUICK if quick else extremes.EXTREMES)
     parts = 2 if quick else 6
     return found + [
-        Job(SECTION, f"extreme cases {i + 1}", "stability:cases", {"names": cases[i::parts]})
+        ReportJob(SECTION, f"extreme cases {i + 1}", "stability:extreme_errors", {"names": cases[i::parts]})
         for i in range(parts)
     ]
 
@@ -61,7 +64,7 @@ def _decades(low: int, high: int, n: int) -> list[float]:
 # --- measuring ---
 
 
-def cells(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[Row]:
+def map_errors(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[Row]:
     """Yield the errors of one step of dt for each value of the map's varied quantity.
 
     If our error exceeds the limit for exactness, the row also has ``roundings``, its error over the effect of
@@ -71,48 +74,48 @@ def cells(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[R
     ends = methods(found, dt)
     for i, (x, case) in enumerate(zip(values, found, strict=True)):
         row: Row = {"kind": "cell", "map": map, "name": name, "dt": dt, "x": x}
-        row |= outcomes(case, dt, {key: end[i] for key, end in ends.items()})
-        error = row["errors"][OURS]
+        row |= largest_errors(case, dt, {key: end[i] for key, end in ends.items()})
+        error = row["errors"][LAG_ENVS]
         if error == DIVERGED or (isinstance(error, float) and error > EXACT):
             row["substeps"] = extremes.substeps(case, dt)
             try:
-                row["roundings"] = _roundings(case, dt, ends[OURS][i])
+                row["roundings"] = _roundings(case, dt, ends[LAG_ENVS][i])
             except ArithmeticError as problem:
-                row["problem"] = describe(problem)
+                row["problem"] = error_line(problem)
         yield row
 
 
 def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
     """Return the largest error of an entry over the effect of one rounding of the start."""
     exact = reference.remembered(case.scene, case.state, case.control, dt)
-    errors, gains = reference.errors(end, exact), extremes.amplification(case, dt)
+    errors, gains = reference.differences(end, exact), extremes.amplification(case, dt)
     shares = [abs(e) / (extremes.EPS * g) for e, g in zip(errors, gains, strict=True) if g]
     return max(shares, default=None)
 
 
-def cases(names: Sequence[str]) -> Iterator[Row]:
+def extreme_errors(names: Sequence[str]) -> Iterator[Row]:
     """Yield the outcomes of the named stiff and extreme cases, beside the comparison integrators."""
     for name in names:
         row: Row = {"kind": "case", "name": name, "peers": {}}
         try:
-            row |= extremes.measure(name)
+            row |= extremes.measure_extreme(name)
             if row["error"] is not None:
                 dt = extremes.EXTREMES[name].dt
-                case = extremes.build(extremes.EXTREMES[name])
+                case = extremes.built_case(extremes.EXTREMES[name])
                 ends = methods([case], dt)
-                row["peers"] = outcomes(case, dt, {key: end[0] for key, end in ends.items()})["errors"]
+                row["peers"] = largest_errors(case, dt, {key: end[0] for key, end in ends.items()})["errors"]
         except Exception as error:
-            row |= {"problem": describe(error)}
+            row |= {"problem": error_line(error)}
         yield row
 
 
-def outcomes(case: Case, dt: float, ends: dict[str, Any]) -> Row:
+def largest_errors(case: Case, dt: float, ends: dict[str, Any]) -> Row:
     """Return the largest error of each end relative to the scales; if there is none, the reason."""
     try:
         exact = reference.remembered(case.scene, case.state, case.control, dt)
     except ArithmeticError as error:  # such as oracle.Unresolved
         kept = {key: end if isinstance(end, str) else NO_REFERENCE for key, end in ends.items()}
-        return {"errors": kept, "problem": describe(error)}
+        return {"errors": kept, "problem": error_line(error)}
     sizes = scales(case, dt)
 
     def relative(end: Any) -> float | str:
@@ -120,7 +123,7 @@ def outcomes(case: Case, dt: float, ends: dict[str, Any]) -> Row:
             return end
         if not np.isfinite(end).all():
             return DIVERGED
-        error = max(abs(e) / s for e, s in zip(reference.errors(end, exact), sizes, strict=True))
+        error = max(abs(e) / s for e, s in zip(reference.differences(end, exact), sizes, strict=True))
         return error if error < FAR_OFF else DIVERGED
 
     return {"errors": {key: relative(end) for key, end in ends.items()}}
@@ -129,10 +132,11 @@ def outcomes(case: Case, dt: float, ends: dict[str, Any]) -> Row:
 def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
     """Return each method's end state for each case, or the reason why there is none.
 
-    Keys are names; ", 16" is added for 16 steps in place of one, ", float32" for that arithmetic. "ours" is
-    the shipped step; "ours, float32" is the formula of its series, with the substeps that the bound requires.
+    Keys are names; ", 16" is added for 16 steps in place of one, ", float32" for that arithmetic. "lag_envs"
+    is the shipped step; "lag_envs, float32" is the formula of its series, with the substeps that the bound
+    requires.
     """
-    ends: dict[str, list[Any]] = {OURS: [_ours(case, dt) for case in found]}
+    ends: dict[str, list[Any]] = {LAG_ENVS: [_shipped(case, dt) for case in found]}
     flow = Stepped(found[0].scene, dt=dt).flow
     with np.errstate(all="ignore"):
         for precision, dtype in PRECISIONS.items():
@@ -140,19 +144,19 @@ def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
             for name in PEERS:
                 for n, times in ((1, ""), (16, ", 16")):
                     counts = np.full(len(found), n)
-                    ends[f"{name}{times}{more}"] = march(
+                    ends[f"{name}{times}{more}"] = step_cases(
                         comparison(name, flow).fast, found, dt, counts, dtype
                     )
         counts = np.array([_count(case, dt) for case in found])
         short = np.minimum(counts, MOST_SUBSTEPS)
-        rows = march(flow.fast, found, dt, np.where(counts > MOST_SUBSTEPS, 1, short), np.float32)
-    ends[f"{OURS}, float32"] = [
+        rows = step_cases(flow.fast, found, dt, np.where(counts > MOST_SUBSTEPS, 1, short), np.float32)
+    ends[f"{LAG_ENVS}, float32"] = [
         TOO_LONG if n > MOST_SUBSTEPS else row for n, row in zip(counts, rows, strict=True)
     ]
     return ends
 
 
-def _ours(case: Case, dt: float) -> Any:
+def _shipped(case: Case, dt: float) -> Any:
     try:
         return case.scene.simulate(case.state, [case.control], dt)[-1].tolist()
     except (StepRefused, ValueError):
@@ -174,7 +178,7 @@ def _count(case: Case, dt: float) -> float:
     return n
 
 
-def march(
+def step_cases(
     fast: Callable, found: Sequence[Case], dt: float, counts: np.ndarray, dtype: type[np.floating]
 ) -> list[list[float]]:
     """Step cases of one scene by a step's formula, on NumPy arrays of one precision.
@@ -193,7 +197,7 @@ def march(
         Precision of everything: constants, state, arithmetic.
     """
     scene = Stepped(found[0].scene)
-    constants = [case.scene._constants() for case in found]
+    constants = [motion_constants_of(case.scene) for case in found]
     k = SimpleNamespace(**{key: np.array([c[key] for c in constants], dtype) for key in constants[0]})
     u = np.array([case.control for case in found], dtype)
     h = (dt / counts).astype(dtype)

@@ -21,7 +21,7 @@ STARTS: dict[str, tuple[tuple[float, ...], float]] = {
 }
 
 
-class Map(NamedTuple):
+class StabilityMap(NamedTuple):
     """A quantity that is varied along with the step."""
 
     label: str
@@ -57,12 +57,14 @@ _BAR, _SHELL = ["PivotedBar"], ["CylinderInCylinder, drag"]
 _SHELL_RADIUS = 0.5
 
 MAPS = {
-    "damping": Map("γ dt", list(VARIANTS), (-3, 6), _damped),
-    "speed": Map("θ' [rad/s]", _BAR + _SHELL, (-2, 7), lambda name, v, dt: _undamped(name, speed=v)),
-    "drive": Map("drive [m/s²]", _BAR, (0, 6), lambda name, u, dt: _undamped(name, control=u)),
-    "gravity": Map("gravity [m/s²]", _BAR, (-3, 3), lambda name, g, dt: _undamped(name, gravity=g)),
-    "length": Map("length [m]", _BAR, (-8, 0), lambda name, length, dt: _undamped(name, com_distance=length)),
-    "arm": Map(
+    "damping": StabilityMap("γ dt", list(VARIANTS), (-3, 6), _damped),
+    "speed": StabilityMap("θ' [rad/s]", _BAR + _SHELL, (-2, 7), lambda name, v, dt: _undamped(name, speed=v)),
+    "drive": StabilityMap("drive [m/s²]", _BAR, (0, 6), lambda name, u, dt: _undamped(name, control=u)),
+    "gravity": StabilityMap("gravity [m/s²]", _BAR, (-3, 3), lambda name, g, dt: _undamped(name, gravity=g)),
+    "length": StabilityMap(
+        "length [m]", _BAR, (-8, 0), lambda name, length, dt: _undamped(name, com_distance=length)
+    ),
+    "arm": StabilityMap(
         "1 - r/R",
         _SHELL,
         (-9, -1),

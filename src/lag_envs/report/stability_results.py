@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lag_envs.report import extremes
-from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.extremes import EXACT
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.runner import JobResult, Row
 from lag_envs.report.stability_maps import MAPS, STARTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PEERS = ("ETD4RK", "implicit midpoint", "RK4", "Verlet", "explicit Euler")
-OURS = "ours"
+LAG_ENVS = "lag_envs"
 #: Contents of a cell other than an error.
 REFUSED, DIVERGED, NO_REFERENCE, TOO_LONG = "refused", "diverged", "no reference", "not run"
 #: An error of this many times the state's size counts as divergence, like a result that is not finite.
@@ -31,7 +31,7 @@ SPECIAL = {DIVERGED: "black", REFUSED: "#d55e00", TOO_LONG: "#d0d0d0", NO_REFERE
 LOWEST, HIGHEST = -17, 2
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     cells = [row for row in rows if row["kind"] == "cell"]
     found = [row for row in rows if row["kind"] == "case"]
@@ -49,7 +49,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
             "max(1, |q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged means "
             f"a result that is not finite or an error above {FAR_OFF:g} times the scale. The reference has "
             "30 digits; if that is not enough, the cell says so.",
-            "Maps in float32 run the same formulas on float32 numbers. Ours then takes the substeps that "
+            "Maps in float32 run the same formulas on float32 numbers. lag_envs then takes the substeps that "
             f"the bound requires, up to {MOST_SUBSTEPS:,}. The jump along the slow manifold, which avoids "
             "most of them under heavy damping, exists in float64 only.",
             "A named case should have full accuracy, be accurate up to the rounding floor, or be refused "
@@ -71,21 +71,21 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
 
 
 def _claims(cells: Sequence[Row], found: Sequence[Row]) -> list[Claim]:
-    ours = [row["errors"][OURS] for row in cells]
-    numbers = [e for e in ours if isinstance(e, float)]
+    own = [row["errors"][LAG_ENVS] for row in cells]
+    numbers = [e for e in own if isinstance(e, float)]
     good = sum(e <= EXACT for e in numbers)
     amplified = [row["roundings"] for row in cells if row.get("roundings")]
     allowed = sum(share <= extremes.ROUNDINGS for share in amplified)
-    unknown, refused = ours.count(NO_REFERENCE), ours.count(REFUSED)
+    unknown, refused = own.count(NO_REFERENCE), own.count(REFUSED)
     missed = [row["name"] for row in found if not row.get("met", False)]
     return [
         Claim(
             f"In every cell of the maps our step is accurate to {EXACT:g} of the scale or to amplified "
             "rounding, or it is refused with an error.",
-            good + allowed + refused + unknown == len(ours) if numbers else None,
-            f"{len(ours)} cells: {good} accurate, {allowed} to amplified rounding (at most "
+            good + allowed + refused + unknown == len(own) if numbers else None,
+            f"{len(own)} cells: {good} accurate, {allowed} to amplified rounding (at most "
             f"{max(amplified, default=0.0):.1f} roundings), {refused} refused, {unknown} without a "
-            f"reference, {len(ours) - good - allowed - refused - unknown} missed",
+            f"reference, {len(own) - good - allowed - refused - unknown} missed",
         ),
         Claim(
             "Every stiff or extreme case is accurate as expected or refused as expected.",
@@ -153,19 +153,19 @@ def _shares(maps: dict[tuple[str, str], list[Row]], name: str, caption: str) -> 
     """Return a table with a line for each map: our results, and each method's share of exact cells."""
     lines: list[list[Any]] = []
     for (map, scene), rows in maps.items():
-        _, largest, *_ = _counts(rows, OURS)
-        _, single, *_ = _counts(rows, f"{OURS}, float32")
-        shares = [f"{100 * _counts(rows, method)[2] / len(rows):.0f} %" for method in (OURS, *PEERS)]
+        _, largest, *_ = _counts(rows, LAG_ENVS)
+        _, single, *_ = _counts(rows, f"{LAG_ENVS}, float32")
+        shares = [f"{100 * _counts(rows, method)[2] / len(rows):.0f} %" for method in (LAG_ENVS, *PEERS)]
         roundings = max((row["roundings"] for row in rows if row.get("roundings")), default=None)
-        refused = _counts(rows, OURS)[3 + list(SPECIAL).index(REFUSED)]
+        refused = _counts(rows, LAG_ENVS)[3 + list(SPECIAL).index(REFUSED)]
         lines.append([scene, map, len(rows), *shares, largest, roundings, refused, single])
     caption += (
         f" Shares of cells in which one step is accurate to {EXACT:g} of the scale; then our largest error, "
         "our error over the effect of a rounding of the start where it is above that, how often our step is "
         "refused, and the largest error of its formula in float32."
     )
-    columns = ["scene", "map", "cells", OURS, *PEERS]
-    columns += ["largest error of ours", "in roundings", "refused", "largest error, float32"]
+    columns = ["scene", "map", "cells", LAG_ENVS, *PEERS]
+    columns += ["largest error of lag_envs", "in roundings", "refused", "largest error, float32"]
     return Table(name, caption, columns, lines) if lines else None
 
 
@@ -175,7 +175,7 @@ def _summary(maps: dict[tuple[str, str], list[Row]]) -> Table | None:
     long = _shares(damped, "", "")
     if long is None:
         return None
-    columns = ["scene", OURS, *PEERS, "largest error of ours"]
+    columns = ["scene", LAG_ENVS, *PEERS, "largest error of lag_envs"]
     places = [list(long.columns).index(name) for name in columns]
     caption = (
         "One step with γ dt from 1e-3 to 1e6 and dt from 1e-6 to 1 s: the share of cases in which each is "
@@ -191,7 +191,7 @@ def _amplified(cells: Sequence[Row]) -> Table | None:
             roundings = row.get("roundings")
             met = roundings is not None and roundings <= extremes.ROUNDINGS
             place = [row["name"], row["map"], row["x"], row["dt"], row["substeps"]]
-            lines.append([*place, row["errors"][OURS], roundings, "met" if met else "missed"])
+            lines.append([*place, row["errors"][LAG_ENVS], roundings, "met" if met else "missed"])
     columns = ["scene", "map", "value", "dt [s]", "substeps", "error", "roundings", "verdict"]
     caption = (
         f"Cells of the maps in which our error is above {EXACT:g} of the scale: the error, and the error "
@@ -200,7 +200,7 @@ def _amplified(cells: Sequence[Row]) -> Table | None:
     return Table("stability-amplified", caption, columns, lines) if lines else None
 
 
-def _problem_table(problems: Sequence[Result], rows: Sequence[Row]) -> Table | None:
+def _problem_table(problems: Sequence[JobResult], rows: Sequence[Row]) -> Table | None:
     lines = [[p.name, p.problem] for p in problems]
     lines += [
         [f"{row['name']}, {row['map']} {row['x']:.2g}, step {row['dt']:.2g} s", row["problem"]]
@@ -221,14 +221,14 @@ def _cell_table(cells: Sequence[Row]) -> Table:
     return Table("stability-cells", "Every cell of every map.", columns, lines)
 
 
-def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> list[Picture]:
+def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> list[ReportFigure]:
     pictures = []
     for (map, name), rows in maps.items():
         for n, times in (("", "in one step"), (", 16", "in 16 steps")):
             if n and (map, name) != ("damping", "PivotedBar"):
                 continue
             pictures.append(
-                Picture(
+                ReportFigure(
                     f"stability-{map}-{_slug(name)}{n.replace(', ', '-')}",
                     f"{name}: error of one control step over {MAPS[map].label} and the step; comparison "
                     f"integrators {times}. Beside each map the same in float32. Start {STARTS[name][0]}. "
@@ -240,9 +240,9 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
     measured = [row for row in found if row.get("peers")]
     if measured:
         pictures.append(
-            Picture(
+            ReportFigure(
                 "extreme-cases-map",
-                "The named cases: log10 of the error of one control step, ours beside the comparison "
+                "The named cases: log10 of the error of one control step, lag_envs beside the comparison "
                 "integrators in one step and in 16. Cases that should be refused are in the table only.",
                 lambda: _draw_cases(measured),
                 raster=True,
@@ -298,13 +298,15 @@ def _draw_map(rows: Sequence[Row], label: str, n: str) -> Figure:
     figure = Figure(figsize=(9, 7), layout="constrained")
     panels = figure.subplots(3, 4, sharex=True, sharey=True)
     shown = [
-        (name if name == OURS else name + n) + more for name in (OURS, *PEERS) for more in ("", ", float32")
+        (name if name == LAG_ENVS else name + n) + more
+        for name in (LAG_ENVS, *PEERS)
+        for more in ("", ", float32")
     ]
     for axes, method in zip(panels.flat, shown, strict=True):
         values = [[known.get((x, y), {}).get(method, NO_REFERENCE) for x in xs] for y in ys]
         mesh = _paint(axes, _edges(xs), _edges(ys), values)
         axes.set(xscale="log", yscale="log")
-        axes.set_title(method, fontsize=9, fontweight="bold" if method == OURS else "normal")
+        axes.set_title(method, fontsize=9, fontweight="bold" if method == LAG_ENVS else "normal")
         axes.tick_params(labelsize=8)
     for axes in panels[-1]:
         axes.set_xlabel(label, fontsize=9)
@@ -321,7 +323,7 @@ def _draw_cases(rows: Sequence[Row]) -> Figure:
 
     order = list(extremes.EXTREMES)
     rows = sorted(rows, key=lambda row: -order.index(row["name"]))
-    methods = [OURS, f"{OURS}, float32", *(name + n for n in ("", ", 16") for name in PEERS)]
+    methods = [LAG_ENVS, f"{LAG_ENVS}, float32", *(name + n for n in ("", ", 16") for name in PEERS)]
     values = [[row["peers"].get(method, NO_REFERENCE) for method in methods] for row in rows]
     figure = Figure(figsize=(9, 2.2 + 0.2 * len(rows)), layout="constrained")
     axes = figure.subplots()

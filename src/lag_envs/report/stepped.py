@@ -1,4 +1,4 @@
-"""A scene in its normal form together with a flow that steps it: ours, or one for comparison."""
+"""A scene in its normal form together with a flow that steps it: the shipped one, or one for comparison."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow, Stepper
 
@@ -36,7 +37,7 @@ class Stepped:
     """
 
     def __init__(self, scene: Scene, flow: Flow | None = None, dt: float = 0.02) -> None:
-        form = scene._form
+        form = form_of(scene)
         if form is None:
             raise ValueError(f"{type(scene).__name__} has no normal form")
         self.scene, self.form = scene, form
@@ -45,7 +46,7 @@ class Stepped:
 
     def constants(self) -> dict[str, float]:
         """Return the arguments of a step."""
-        return self.scene._constants()
+        return motion_constants_of(self.scene)
 
     def numbers(self) -> SimpleNamespace:
         """Return the arguments by attribute."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lag_envs.report.cases import Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import motion_constants_of
 from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import Flow
 
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 K = TypeVar("K")
 
 
-class Kernels:
+class FlowSteps:
     """The steps of a scene by one flow.
 
     Parameters
@@ -33,7 +34,7 @@ class Kernels:
     scene : Scene
         Its zero constants decide the code; problems on the same kind of scene share it.
     flow : Flow, optional
-        Ours for steps of `dt`, or a comparison integrator.
+        The shipped one for steps of `dt`, or a comparison integrator.
     dt : float
         Control step [s].
 
@@ -57,7 +58,7 @@ class Kernels:
 
     def arguments(self, scene: Scene, dt: float) -> tuple[float, ...]:
         """Return the arguments of the compiled functions after states and controls."""
-        constants = scene._constants()
+        constants = motion_constants_of(scene)
         present = [name for name, value in constants.items() if value != 0.0]
         if present != self._names:
             raise ValueError(f"compiled for the constants {self._names}, got {present}")
@@ -152,7 +153,7 @@ class Kernels:
 
 
 class Sample(NamedTuple):
-    """A sample to time: `run` does so many control steps, after `prepare`, which is not timed."""
+    """A sample to time: `run` does this many control steps, after `prepare`, which is not timed."""
 
     run: Callable[[], object]
     steps: int
@@ -166,7 +167,7 @@ class Sample(NamedTuple):
         return self.ends()
 
 
-def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: float) -> Sample:
+def one_by_one(kernels: FlowSteps, cases: Sequence[Case], controls: Array, dt: float) -> Sample:
     """Return the sample of trajectories one after the other.
 
     Parameters
@@ -187,7 +188,7 @@ def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: flo
     return Sample(lambda: several(paths, given, *arguments), controls.size, ends=lambda: paths[:, -1])
 
 
-def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> Sample:
+def at_once(kernels: FlowSteps, cases: Sequence[Case], steps: int, dt: float) -> Sample:
     """Return the sample of a batch, each state with its control held for some steps."""
     batch, arguments = kernels.batch, kernels.arguments(cases[0].scene, dt)
     start = kernels.fill(cases)

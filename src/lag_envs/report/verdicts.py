@@ -1,8 +1,7 @@
 """Results from the points of `work_precision`: who is faster at which error, in tables, claims and sentences.
 
-Ours is the shipped stepping. Everybody's fastest form and setting that reaches an error is compared with our
-fastest that reaches it; defeats are reported like wins. Sentences are made from the numbers, so they cannot
-go stale.
+The fastest form and setting of each rival that reaches an error is compared with the fastest of the shipped
+stepping; defeats are reported like wins. Sentences are made from the numbers, so they cannot go stale.
 """
 
 from __future__ import annotations
@@ -13,12 +12,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lag_envs.report.cases import VARIANTS
-from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.diagrams import draw
-from lag_envs.report.points import HORIZONS, LIBRARIES, MODES, Point, gathered
-from lag_envs.report.runner import Result, Row
+from lag_envs.report.content import Claim, Content, ReportFigure, Table
+from lag_envs.report.diagrams import draw_variant
+from lag_envs.report.points import HORIZONS, LIBRARIES, MODES, WorkPrecisionPoint, gathered
+from lag_envs.report.runner import JobResult, Row
 
-OURS = "lag_envs"
+LAG_ENVS = "lag_envs"
 ROUNDING = 2.0**-53
 #: An error below this many roundings, or amplified roundings, counts as no error at all.
 ROUNDINGS = 4
@@ -26,8 +25,8 @@ ROUNDINGS = 4
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 #: The ones shown in README.
 SHOWN = TARGETS[1:]
-#: Error at which ours is claimed to be the fastest: the promised accuracy of a step, and what the system's
-#: amplification leaves of it over a long time.
+#: Error at which lag_envs is claimed to be the fastest: the promised accuracy of a step, and what the
+#: system's amplification leaves of it over a long time.
 CLAIMED = {"one step": 1e-12, "10 s": 1e-12, "1,000 s": 1e-9}
 
 #: Required error of each form's finest setting, so that none is fast because it is broken.
@@ -41,20 +40,20 @@ def floors(rows: Sequence[Row]) -> dict[tuple, float]:
     }
 
 
-class Comparison(NamedTuple):
-    """The fastest of ours and the fastest rival that reach an error, on one variant, horizon and mode."""
+class Duel(NamedTuple):
+    """The fastest form of lag_envs and the fastest rival to reach an error: one variant, horizon and mode."""
 
     variant: str
     horizon: str
     mode: str
     target: float
-    ours: Point | None
-    rival: Point | None
+    own: WorkPrecisionPoint | None
+    rival: WorkPrecisionPoint | None
 
     @property
     def ratio(self) -> float | None:
-        """The rival's time over ours; below 1 the rival wins."""
-        return self.rival.ns / self.ours.ns if self.ours and self.rival else None
+        """The rival's time over that of lag_envs; below 1 the rival wins."""
+        return self.rival.ns / self.own.ns if self.own and self.rival else None
 
     @property
     def lost(self) -> bool:
@@ -67,7 +66,7 @@ class Comparison(NamedTuple):
         return f"{self.variant} {MODES[self.mode]}"
 
 
-def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Comparison]:
+def compared(points: Sequence[WorkPrecisionPoint], floor: dict[tuple, float]) -> list[Duel]:
     """Return all comparisons, with errors up to `ROUNDINGS` amplified roundings counting as none."""
     found = []
     for variant in VARIANTS:
@@ -78,16 +77,16 @@ def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Compari
                 for target in TARGETS if here else ():
                     reached = [p for p in here if p.worst <= max(target, least)]
                     found.append(
-                        Comparison(
+                        Duel(
                             variant, horizon, mode, target,
-                            min((p for p in reached if p.ours), key=lambda p: p.ns, default=None),
-                            min((p for p in reached if not p.ours), key=lambda p: p.ns, default=None),
+                            min((p for p in reached if p.own), key=lambda p: p.ns, default=None),
+                            min((p for p in reached if not p.own), key=lambda p: p.ns, default=None),
                         )
                     )  # fmt: skip
     return found
 
 
-def content(rows: list[Row], problems: list[Result]) -> Content:
+def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section."""
     points = gathered(rows)
     floor = floors(rows)
@@ -95,10 +94,11 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     variants = [name for name in VARIANTS if any(p.variant == name for p in points)]
     return Content(
         title="Error against time",
-        text=[*_text(rows), *findings(found)],
+        text=[*_text(rows), *horizon_findings(found)],
         tables=[_targets(found), _near(points), _orders(rows), _failed(rows, problems)],
         pictures=[
-            Picture(_file(name), _caption(name), partial(draw, name, points, floor)) for name in variants
+            ReportFigure(_file(name), _caption(name), partial(draw_variant, name, points, floor))
+            for name in variants
         ],
         claims=claims(rows, points, found),
         summary=_summary(points, found),
@@ -119,29 +119,29 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "where there is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and "
         "drive), else Taylor series in fixed-point arithmetic. The control is held over the whole time. Over "
         "1,000 s there is no control, and pendulums have no damping.",
-        "Ours is the shipped stepping: each scene's own order and tolerance, control step by control step. "
+        "lag_envs is timed as shipped: each scene's own order and tolerance, control step by control step. "
         "Over 10 s and 1,000 s there are also steps of half to eight times that length, and a single step "
         "that `simulate` divides ('lag_envs, one call'). The time includes the test whether a step is "
         "certified.",
         "Every rival gets the scene's own equation in its fastest form, and errors are those of the calls "
         "that are timed. The usual integrators are compiled by the same compiler at the same vector width "
-        "as ours, with precomputed coefficients. 'Carried' ones have cosine and sine as unknowns, or rotate "
-        "them by short polynomials, and call no function. When a control is held for long they also take "
-        "one step for several control steps. heyoka runs with fast_math: single steps are its own machine "
-        "code called from a compiled loop, longer times one call of propagate_until, and a batch goes in "
-        "blocks of twice the recommended width. SciPy's compiled dopri5, dop853 and lsoda have a compiled "
-        "right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is compiled as a "
+        "as lag_envs, with precomputed coefficients. 'Carried' ones have cosine and sine as unknowns, or "
+        "rotate them by short polynomials, and call no function. When a control is held for long they also "
+        "take one step for several control steps. heyoka runs with fast_math: single steps are its own "
+        "machine code called from a compiled loop, longer times one call of propagate_until, and a batch "
+        "goes in blocks of twice the recommended width. SciPy's compiled dopri5, dop853 and lsoda have a "
+        "compiled right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is compiled as a "
         "whole, as a loop over states or a map. torchdiffeq has a batch as one tensor. MuJoCo runs in its "
         "compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no batch, so "
-        "theirs is one state after the other. Anything that would take longer than some seconds is not "
+        "they take one state after the other. Anything that would take longer than some seconds is not "
         "run.",
-        "Times are those of one control step. Everything in a job is timed in turn with ours, and the median "
-        "is taken. Jobs are brought to one scale by our own time in each. Over 10 s or 1,000 s, slow methods "
-        "are timed over only part of that, also in one call.",
+        "Times are those of one control step. Everything in a job is timed in turn with lag_envs, and the "
+        "median is taken. Jobs are brought to one scale by the time of lag_envs in each. Over 10 s or 1,000 "
+        "s, slow methods are timed over only part of that, also in one call.",
     ]
 
 
-def findings(found: Sequence[Comparison]) -> list[str]:
+def horizon_findings(found: Sequence[Duel]) -> list[str]:
     """Return, for every horizon, a paragraph on who is faster at which error, and by how much."""
     paragraphs = []
     for horizon in HORIZONS:
@@ -152,7 +152,7 @@ def findings(found: Sequence[Comparison]) -> list[str]:
     return paragraphs
 
 
-def _finding(found: Sequence[Comparison]) -> str:
+def _finding(found: Sequence[Duel]) -> str:
     """Return who is faster at one error, as a clause that counts every comparison."""
     settled = sorted((d for d in found if d.ratio is not None), key=lambda d: d.ratio or 0.0)
     lost = [d for d in settled if d.lost]
@@ -162,18 +162,18 @@ def _finding(found: Sequence[Comparison]) -> str:
         named = [f"{d.ratio:.2g} ({d.where}: {d.rival.label})" for d in (lost[0], lost[-1]) if d.rival]
         parts.append(
             f"a rival is faster in {len(lost)} of {len(found)} comparisons and takes "
-            f"{' to '.join(dict.fromkeys(named))} of our time"
+            f"{' to '.join(dict.fromkeys(named))} of the time of lag_envs"
         )
     if won:
         ratios = [f"{d.ratio:.2g}" for d in (won[0], won[-1])]
         parts.append(
-            f"ours is faster in {len(won)} of {len(found)}, where the fastest rival takes "
+            f"lag_envs is faster in {len(won)} of {len(found)}, where the fastest rival takes "
             f"{' to '.join(dict.fromkeys(ratios))} times as long"
         )
     for words, some in (
-        ("nobody else gets there", [d for d in found if d.ours and not d.rival]),
-        ("ours does not get there and a rival does", [d for d in found if d.rival and not d.ours]),
-        ("nobody gets there", [d for d in found if not d.rival and not d.ours]),
+        ("nobody else gets there", [d for d in found if d.own and not d.rival]),
+        ("lag_envs does not get there and a rival does", [d for d in found if d.rival and not d.own]),
+        ("nobody gets there", [d for d in found if not d.rival and not d.own]),
     ):
         if some:
             parts.append(f"{words} in {len(some)} ({_listed(d.where for d in some)})")
@@ -187,19 +187,19 @@ def _listed(parts: Iterable[str]) -> str:
 # --- tables ---
 
 
-def _targets(found: Sequence[Comparison]) -> Table:
+def _targets(found: Sequence[Duel]) -> Table:
     return Table(
         "work_precision_targets",
-        "The fastest form of ours and of all others that reaches an error; below 1 the other is "
+        "The fastest form of lag_envs and of all others that reaches an error; below 1 the other is "
         "faster. Empty cell: not reached.",
         [
-            "scene", "horizon", "mode", "error", "ours", "ours: error", "ours: ns", "fastest other",
-            "other: error", "other: ns", "other / ours",
+            "scene", "horizon", "mode", "error", "lag_envs", "lag_envs: error", "lag_envs: ns",
+            "fastest other", "other: error", "other: ns", "other / lag_envs",
         ],
         [
             [
                 d.variant, d.horizon, MODES[d.mode], d.target,
-                d.ours and d.ours.label, d.ours and d.ours.worst, d.ours and d.ours.ns,
+                d.own and d.own.label, d.own and d.own.worst, d.own and d.own.ns,
                 d.rival and d.rival.label, d.rival and d.rival.worst, d.rival and d.rival.ns, d.ratio,
             ]
             for d in found
@@ -211,7 +211,7 @@ def _targets(found: Sequence[Comparison]) -> Table:
 NEAR = 10.0
 
 
-def _near(points: Sequence[Point]) -> Table:
+def _near(points: Sequence[WorkPrecisionPoint]) -> Table:
     table = _rivals(points)
     rows = [row for row in table.rows if min(x for x in row[3:-1] if x is not None) <= NEAR]
     return Table(
@@ -219,19 +219,19 @@ def _near(points: Sequence[Point]) -> Table:
     )
 
 
-def _rivals(points: Sequence[Point]) -> Table:
+def _rivals(points: Sequence[WorkPrecisionPoint]) -> Table:
     """Return every rival's shortest time to each error, for one step."""
     rows = []
-    here = [p for p in points if p.horizon == "one step" and not p.ours]
+    here = [p for p in points if p.horizon == "one step" and not p.own]
     for variant in VARIANTS:
         for mode, words in MODES.items():
-            own = [p for p in here if (p.variant, p.mode) == (variant, mode)]
-            ours = _default(points, variant, mode)
-            for name in dict.fromkeys(p.name for p in own) if ours else ():
-                some = [p for p in own if p.name == name]
+            group = [p for p in here if (p.variant, p.mode) == (variant, mode)]
+            shipped = _default(points, variant, mode)
+            for name in dict.fromkeys(p.name for p in group) if shipped else ():
+                some = [p for p in group if p.name == name]
                 best = [min((p.ns for p in some if p.worst <= t), default=None) for t in TARGETS]
-                if ours and any(best):
-                    ratios = [ns and ns / ours.ns for ns in best]
+                if shipped and any(best):
+                    ratios = [ns and ns / shipped.ns for ns in best]
                     rows.append([variant, words, name, *ratios, min(p.worst for p in some)])
     return Table(
         "work_precision_rivals",
@@ -242,21 +242,21 @@ def _rivals(points: Sequence[Point]) -> Table:
     )
 
 
-def _default(points: Sequence[Point], variant: str, mode: str) -> Point | None:
-    key = variant, "one step", mode, OURS
+def _default(points: Sequence[WorkPrecisionPoint], variant: str, mode: str) -> WorkPrecisionPoint | None:
+    key = variant, "one step", mode, LAG_ENVS
     return next((p for p in points if (p.variant, p.horizon, p.mode, p.method) == key), None)
 
 
-def _summary(points: Sequence[Point], found: Sequence[Comparison]) -> Table:
+def _summary(points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> Table:
     rows = []
     for name in VARIANTS:
         for mode, words in MODES.items():
-            ours = _default(points, name, mode)
-            if ours is None:
+            shipped = _default(points, name, mode)
+            if shipped is None:
                 continue
             here = {d.target: d for d in found if (d.variant, d.horizon, d.mode) == (name, "one step", mode)}
             rows.append([
-                name, words, f"{ours.worst:.0e}", round(ours.ns, 1), *(_rival(here[t]) for t in SHOWN),
+                name, words, f"{shipped.worst:.0e}", round(shipped.ns, 1), *(_rival(here[t]) for t in SHOWN),
             ])  # fmt: skip
     steps = [d for d in found if d.horizon == "one step"]
     sentences = [f"To {t:.0e}: {_finding([d for d in steps if d.target == t])}." for t in SHOWN if steps]
@@ -264,13 +264,13 @@ def _summary(points: Sequence[Point], found: Sequence[Comparison]) -> Table:
         "work_precision",
         "One control step of each scene, alone and in a batch of 1,024: largest error and time of lag_envs "
         "as shipped, and the fastest of its rivals, each in its fastest form, that reaches an error, with "
-        "its time as a multiple of ours; below 1 the rival is faster. " + " ".join(sentences),
+        "its time as a multiple of that of lag_envs; below 1 the rival is faster. " + " ".join(sentences),
         ["scene", "mode", "error", "ns", *(f"to {target:.0e}" for target in SHOWN)],
         rows,
     )
 
 
-def _rival(comparison: Comparison) -> str:
+def _rival(comparison: Duel) -> str:
     return (
         f"{comparison.rival.label}: {comparison.ratio:.2g} ×"
         if comparison.rival and comparison.ratio
@@ -293,7 +293,7 @@ def _orders(rows: Sequence[Row]) -> Table:
     )
 
 
-def _failed(rows: Sequence[Row], problems: Sequence[Result]) -> Table:
+def _failed(rows: Sequence[Row], problems: Sequence[JobResult]) -> Table:
     found = [[result.name, "", "", result.problem] for result in problems]
     found += [
         [row["variant"], f"{row['horizon']}, {MODES[row['mode']]}", _setting(row), row["problem"]]
@@ -329,7 +329,7 @@ def _setting(row: Row) -> str:
     return f"{LIBRARIES.get(row['family'], '')} {row['method']}, {row['setting']:g}".strip()
 
 
-def _all(points: Sequence[Point]) -> Table:
+def _all(points: Sequence[WorkPrecisionPoint]) -> Table:
     return Table(
         "work_precision_points",
         "All points: largest and median error, members lost, time of a control step.",
@@ -344,10 +344,10 @@ def _all(points: Sequence[Point]) -> Table:
 # --- claims ---
 
 
-def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Comparison]) -> list[Claim]:
+def claims(rows: Sequence[Row], points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> list[Claim]:
     """Return the claims; whether they hold is measured, and README lists those that do not."""
     made = [_fastest(found, horizon, target) for horizon, target in CLAIMED.items()]
-    steps = [p for p in points if p.ours and p.method == OURS and p.horizon == "one step"]
+    steps = [p for p in points if p.own and p.method == LAG_ENVS and p.horizon == "one step"]
     largest = max((p.worst for p in steps), default=math.nan)
     made.append(
         _claim(
@@ -383,7 +383,7 @@ def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Compari
     same = _same_bits(rows)
     made.append(
         _claim(
-            "Batches that are timed end bit for bit where single trajectories do, for ours and the others",
+            "Batches that are timed end bit for bit where single trajectories do, for lag_envs and others",
             same,
             lambda: all(same),
             lambda: f"{sum(same)} of {len(same)}",
@@ -396,15 +396,15 @@ def _claim(text: str, measured: Any, holds: Callable[[], bool], evidence: Callab
     return Claim(text, holds(), evidence()) if measured else Claim(text, None, "not measured")
 
 
-def _fastest(found: Sequence[Comparison], horizon: str, target: float) -> Claim:
-    here = [d for d in found if d.horizon == horizon and d.target == target and (d.ours or d.rival)]
+def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
+    here = [d for d in found if d.horizon == horizon and d.target == target and (d.own or d.rival)]
     lost = [d for d in here if d.lost]
 
     def evidence() -> str:
         ratios = [d.ratio for d in here if d.ratio is not None]
         if lost:
             faster = "; ".join(
-                f"{d.where}: {d.rival.label}, {f'{d.ratio:.2g} ×' if d.ratio else 'ours not at all'}"
+                f"{d.where}: {d.rival.label}, {f'{d.ratio:.2g} ×' if d.ratio else 'lag_envs not at all'}"
                 for d in lost
                 if d.rival
             )
@@ -427,12 +427,12 @@ def _fastest(found: Sequence[Comparison], horizon: str, target: float) -> Claim:
 LOW = ("explicit Euler", "semi-implicit Euler", "Verlet", "implicit midpoint", "Euler", "implicitfast")
 
 
-def _finest(points: Sequence[Point]) -> dict[tuple[str, str], float]:
+def _finest(points: Sequence[WorkPrecisionPoint]) -> dict[tuple[str, str], float]:
     """Return the smallest error that each form of each rival has in one step, by method and place."""
     found: dict[tuple[str, str], float] = {}
     for p in points:
         low = p.method.partition(",")[0] in LOW
-        if p.horizon == "one step" and not p.ours and not low:
+        if p.horizon == "one step" and not p.own and not low:
             key = p.name, f"{p.variant} {MODES[p.mode]}"
             found[key] = min(found.get(key, math.inf), p.worst)
     return found
@@ -441,7 +441,7 @@ def _finest(points: Sequence[Point]) -> dict[tuple[str, str], float]:
 def _same_bits(rows: Sequence[Row]) -> list[bool]:
     seen: dict[tuple, dict[str, str]] = {}
     for r in rows:
-        if r["kind"] == "point" and r["family"] in ("ours", "compiled") and "digest" in r:
+        if r["kind"] == "point" and r["family"] in ("lag_envs", "compiled") and "digest" in r:
             key = r["variant"], r["horizon"], r["method"], r["setting"]
             seen.setdefault(key, {})[r["mode"]] = r["digest"]
     return [len(set(digests.values())) == 1 for digests in seen.values() if len(digests) == len(MODES)]

@@ -1,7 +1,7 @@
 """Error against time: the shipped stepping, the usual integrators, other libraries.
 
-Every rival runs in its fastest form (`rivals`, `peers`), alone and in a batch, and the errors are those of
-the timed calls. `verdicts` compares and reports the measurements, `diagrams` draws them.
+Every rival runs in its fastest form (`variant_rivals`, `peers`), alone and in a batch, and the errors are
+those of the timed calls. `verdicts` compares and reports the measurements, `diagrams` draws them.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
 from lag_envs.report.integrators import METHODS, comparison, plain_series
 from lag_envs.report.points import MODES
-from lag_envs.report.rivals import Compiled, Ours, Rival
-from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.rivals import CompiledMethod, Rival, ShippedStepping
+from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.timing import Kernels, Sample, interleaved
+from lag_envs.report.timing import FlowSteps, Sample, interleaved
 from lag_envs.report.verdicts import ROUNDING, content
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.flows import Flow
 
-__all__ = ["content", "errors", "jobs", "orders", "points"]
+__all__ = ["content", "jobs", "orders", "state_errors", "variant_points"]
 
 SECTION = "work_precision"
 #: Orders of the series whose convergence is measured; orders that are not shipped are used for nothing else.
@@ -76,12 +76,12 @@ def control_step(variant: str) -> float:
     return round(VARIANTS[variant].dt * 2**36) / 2**36
 
 
-def jobs(quick: bool) -> list[Job]:
-    """Return the jobs: references, then points of ours and of the usual integrators, then of libraries."""
+def jobs(quick: bool) -> list[ReportJob]:
+    """Return the jobs: references, then points of lag_envs and the usual integrators, then of libraries."""
     names = QUICK_VARIANTS if quick else tuple(VARIANTS)
     horizons = QUICK if quick else HORIZONS
     made = [
-        Job(
+        ReportJob(
             SECTION,
             f"references: {name}, {horizon}",
             f"{SECTION}:references",
@@ -91,7 +91,7 @@ def jobs(quick: bool) -> list[Job]:
         for horizon in horizons
         for name in names
     ]
-    made.append(Job(SECTION, "orders", f"{SECTION}:orders", {"variant": "PivotedBar", "quick": quick}))
+    made.append(ReportJob(SECTION, "orders", f"{SECTION}:orders", {"variant": "PivotedBar", "quick": quick}))
     for name in names:
         kinds = [
             package
@@ -99,7 +99,7 @@ def jobs(quick: bool) -> list[Job]:
             if name in COVERED.get(package, names) and peer.solves(VARIANTS[name].scene())
         ]
         made += [
-            Job(
+            ReportJob(
                 SECTION,
                 f"{family}: {name}",
                 f"{SECTION}:points",
@@ -129,7 +129,7 @@ def _undamped(scene: Scene) -> Scene:
     return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
 
 
-class Truth(NamedTuple):
+class ExactEnd(NamedTuple):
     """The exact end of a problem."""
 
     case: Case
@@ -141,27 +141,28 @@ class Truth(NamedTuple):
         if not np.isfinite(state).all():
             return math.inf
         return max(
-            abs(e) / s for e, s in zip(reference.errors(state.tolist(), self.end), self.scale, strict=True)
+            abs(e) / s
+            for e, s in zip(reference.differences(state.tolist(), self.end), self.scale, strict=True)
         )
 
 
-def truth(case: Case, dt: float, steps: int) -> Truth:
+def exact_end(case: Case, dt: float, steps: int) -> ExactEnd:
     """Return the exact end; errors of one step are relative to the start's size, later ones to the end's."""
     end = reference.remembered(case.scene, case.state, case.control, dt * steps)
     at = case if steps == 1 else case._replace(state=tuple(map(float, end)))
-    return Truth(case, end, scales(at, dt))
+    return ExactEnd(case, end, scales(at, dt))
 
 
-def truths(variant: str, horizon: str, plan: Horizon) -> list[Truth]:
+def truths(variant: str, horizon: str, plan: Horizon) -> list[ExactEnd]:
     """Return the exact ends of a horizon's members."""
     dt = control_step(variant)
     return [
-        truth(case, dt, plan.steps(dt))
+        exact_end(case, dt, plan.steps(dt))
         for case in problems(variant, horizon, ensemble(variant, plan.members))
     ]
 
 
-def amplified(some: Sequence[Truth], dt: float, steps: int) -> float:
+def amplified(some: Sequence[ExactEnd], dt: float, steps: int) -> float:
     """Return the median effect of one rounding of the start, relative to the scales."""
     from mpmath import mp, mpf
 
@@ -169,7 +170,7 @@ def amplified(some: Sequence[Truth], dt: float, steps: int) -> float:
     for case, end, scale in some:
         with mp.workdps(40):
             state = [mpf(x) * (1 + mpf(ROUNDING)) for x in case.state]
-            moved = reference.flow(case.scene, state, case.control, dt * steps, digits=20)
+            moved = reference.exact_flow(case.scene, state, case.control, dt * steps, digits=20)
             found.append(max(float(abs(a - b)) / s for a, b, s in zip(moved, end, scale, strict=True)))
     return median(found)
 
@@ -185,7 +186,7 @@ def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
     }  # fmt: skip
 
 
-def errors(some: Sequence[Truth], ends: Array) -> Row:
+def state_errors(some: Sequence[ExactEnd], ends: Array) -> Row:
     """Return errors of states, the largest and median of those below 1, and the number of lost members."""
     found = [t.error(end) for t, end in zip(some, ends, strict=True)]
     kept = [error for error in found if error < 1.0]
@@ -201,25 +202,28 @@ def errors(some: Sequence[Truth], ends: Array) -> Row:
 # --- points ---
 
 
-def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
-    """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
+def variant_rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
+    """Return a family's methods at all settings; lag_envs is among the compiled ones."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
         equation = Problems(problems(variant, horizon, ensemble(variant, 1))).equation
-        methods = [m for m in Compiled.methods(equation) if not quick or m in QUICK_METHODS]
-        ours = [Ours(Ours.METHOD, 1)]
+        methods = [m for m in CompiledMethod.methods(equation) if not quick or m in QUICK_METHODS]
+        shipped = [ShippedStepping(ShippedStepping.METHOD, 1)]
         if plan.seconds is not None:  # a constant control may be stepped with any dt
-            ours += [*(Ours(Ours.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)), Ours(Ours.ONE_CALL, 1)]
+            shipped += [
+                *(ShippedStepping(ShippedStepping.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)),
+                ShippedStepping(ShippedStepping.ONE_CALL, 1),
+            ]
         return [
-            *ours,
-            *(Compiled(method, n) for method in methods for n in plan.substeps),
+            *shipped,
+            *(CompiledMethod(method, n) for method in methods for n in plan.substeps),
         ]
     kind = peers.PEERS[family]
     some = slice(1, None, 3) if quick else slice(None)
     return [kind(method, setting) for method, found in kind.settings.items() for setting in found[some]]
 
 
-def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
+def variant_points(variant: str, family: str, quick: bool) -> Iterator[Row]:
     """Yield errors and times of a family on a variant, alone and in a batch.
 
     Every row has as its `clock` our time of a control step, measured in turn with it in the same job.
@@ -234,7 +238,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
             found: list[Row] = []
             samples: list[Sample] = []
             done: dict[str, float] = {}  # error so far of methods; -1 if finer settings are not run
-            for rival in rivals(variant, horizon, family, quick):
+            for rival in variant_rivals(variant, horizon, family, quick):
                 if done.get(rival.method) == -1.0 or (together and not rival.batched):
                     continue
                 about = {
@@ -248,7 +252,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                     yield about | {"problem": str(error)}
                     done[rival.method] = -1.0
                 except Exception as error:
-                    yield about | {"problem": describe(error)}
+                    yield about | {"problem": error_line(error)}
                     if isinstance(error, ImportError):
                         return
                 else:
@@ -258,14 +262,14 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                         at_rounding = row["error"] < 4.0 * ROUNDING
                         no_better = row["error"] > 0.7 * done.get(rival.method, math.inf)
                         done[rival.method] = -1.0 if at_rounding or no_better else row["error"]
-            clock = timed(Ours(Ours.METHOD, 1), base, dt, steps, together)
+            clock = timed(ShippedStepping(ShippedStepping.METHOD, 1), base, dt, steps, together)
             times = interleaved(dict(enumerate([clock, *samples])), 5 if quick else 9)
             for i, row in enumerate(found):
                 yield row | {"ns": times[i + 1], "clock": times[0]}
 
 
 def point(
-    rival: Rival, some: Sequence[Truth], base: Sequence[Case], dt: float, steps: int, together: bool
+    rival: Rival, some: Sequence[ExactEnd], base: Sequence[Case], dt: float, steps: int, together: bool
 ) -> tuple[Row, Sample]:
     """Return the errors of a rival, and the sample for timing it.
 
@@ -277,14 +281,14 @@ def point(
     members = [t.case for t in some]
     # If states share their steps, errors are from a batch as large as the timed one.
     cases = [*members, *base[len(members) :]] if together and rival.shared else members
-    if rival.family != "ours":
+    if rival.family != "lag_envs":
         few = cases if together else cases[:1]
         expected = _seconds(rival, few, dt, steps, together) * len(cases) / len(few)
         if expected > LIMIT:
             raise TimeoutError(f"not run, it would take {expected:.0f} s")
     ends = rival.build(Problems(cases), dt, steps, together).end()[: len(some)]
     known = np.where(np.isnan(ends), np.nan, ends)  # NaN has many bit patterns
-    row = errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}
+    row = state_errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}
     return row, timed(rival, base, dt, steps, together)
 
 
@@ -344,7 +348,7 @@ def repeated(sample: Sample, times: int) -> Sample:
 # --- orders of convergence ---
 
 
-class Series(NamedTuple):
+class OrderedMethod(NamedTuple):
     """A method whose order is measured."""
 
     method: str
@@ -352,14 +356,16 @@ class Series(NamedTuple):
     order: int
 
 
-def series(scene: Scene, quick: bool = False) -> list[Series]:
-    """Return all methods that have an order: ours at several orders, and the usual integrators."""
+def series(scene: Scene, quick: bool = False) -> list[OrderedMethod]:
+    """Return all methods that have an order: lag_envs at several orders, and the usual integrators."""
     found, flow = [], Stepped(scene).flow
     if flow.order:
-        found = [Series(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)]
-    forms = {"": False, Compiled.CARRIED: True}
+        found = [
+            OrderedMethod(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)
+        ]
+    forms = {"": False, CompiledMethod.CARRIED: True}
     found += [
-        Series(name + form, comparison(name, flow, carried), method.order)
+        OrderedMethod(name + form, comparison(name, flow, carried), method.order)
         for name, method in METHODS.items()
         for form, carried in forms.items()
         if not quick or name + form in QUICK_METHODS
@@ -378,19 +384,19 @@ def orders(variant: str, quick: bool) -> Iterator[Row]:
         }  # fmt: skip
 
 
-def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[Truth]]:
+def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[ExactEnd]]:
     """Return the exact ends of single steps of several lengths, each √2 times the previous one."""
     lengths = [round(VARIANTS[variant].dt * 2 ** (k / 2) * 2**36) / 2**36 for k in range(-4, 9)]
-    return {h: [truth(case, h, 1) for case in cases] for h in lengths}
+    return {h: [exact_end(case, h, 1) for case in cases] for h in lengths}
 
 
-def measured_order(found: Series, ends: Mapping[float, Sequence[Truth]]) -> float | None:
+def measured_order(found: OrderedMethod, ends: Mapping[float, Sequence[ExactEnd]]) -> float | None:
     """Return the slope of the error of one step over its length, minus one; None if there is none."""
-    kernels = Kernels(next(iter(ends.values()))[0].case.scene, found.flow)
-    return slope({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
+    kernels = FlowSteps(next(iter(ends.values()))[0].case.scene, found.flow)
+    return observed_order({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
 
 
-def slope(found: Mapping[float, Sequence[float]]) -> float | None:
+def observed_order(found: Mapping[float, Sequence[float]]) -> float | None:
     """Return the observed order from the errors of steps of several lengths, as median over members.
 
     The comparison uses the shortest steps h and 2h whose errors are well above rounding in half of the

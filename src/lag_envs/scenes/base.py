@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import math
 from abc import ABCMeta
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -16,13 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics import motion, recording
 from lag_envs.mechanics.algebra import Atom, FormulaError
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLanes, Point, exactly
-from lag_envs.mechanics.layout import Layout, make_layout
+from lag_envs.mechanics.evaluation import (
+    DualArray,
+    DualArrayFunctions,
+    LaneArray,
+    LaneArrayFunctions,
+    MotionPoint,
+    Numeric,
+    exactly,
+)
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import TWIN, Values
+from lag_envs.mechanics.recording import TWIN, Values, parameter_values
 from lag_envs.scenes import picture, steps
 from lag_envs.scenes.checks import check_both
-from lag_envs.scenes.declaring import MAPPINGS, ORDER, SEQUENCES, complete, controls_of, declare
+from lag_envs.scenes.declaring import ORDER, complete, declare_scene
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.door import admit, check_class
 from lag_envs.scenes.parameters import parameter as parameter
 from lag_envs.scenes.shapes import Window
@@ -31,9 +38,7 @@ if TYPE_CHECKING:
     import sympy
 
     from lag_envs.scenes.fitting.result import Fit
-    from lag_envs.stepping.general import SeriesStepper, StepBound
-    from lag_envs.stepping.lag import LaggedStepper
-    from lag_envs.stepping.normal_forms import NormalForm
+    from lag_envs.stepping.general import StepBound
 
 Array = NDArray[np.float64]
 
@@ -175,25 +180,9 @@ class Scene(metaclass=SceneType):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        declare(cls, SceneType)
+        declare_scene(cls, SceneType)
 
     _faults: ClassVar[tuple[str, ...]] = ()
-
-    def _numbers(self) -> tuple[str, ...]:
-        """Return the names of the parameters that have a value."""
-        fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        return tuple(f.name for f in fields if "unit" in f.metadata and getattr(self, f.name) is not None)
-
-    @property
-    def _structure(self) -> tuple:
-        """Everything that decides the code of a step; scenes that agree in it differ only in numbers."""
-        cls, numbers = type(self), self._numbers()
-        # By identity: keeping a formula that calls super() would keep its own class alive.
-        formulas = tuple(id(getattr(cls, name)) for name in ("rests", *recording.ARGUMENTS))
-        fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        plain = tuple((f.name, getattr(self, f.name)) for f in fields if "unit" not in f.metadata)
-        zero = tuple(name for name in numbers if getattr(self, name) == 0.0)
-        return formulas, plain, numbers, zero
 
     def __setattr__(self, name: str, value: Any) -> NoReturn:
         raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
@@ -209,21 +198,6 @@ class Scene(metaclass=SceneType):
     # --- derived: names ------------------------------------------------------------------------------------
 
     @property
-    def _layout(self) -> Layout:
-        """Names of coordinates, controls and state."""
-        found = vars(self).get("_cached_layout")
-        if found is None:
-            # Properties may branch on structural fields and use them as counts, but not parameters.
-            copy, declared = recording.symbolic_twin(self), {}
-            for name in (*MAPPINGS, *SEQUENCES):
-                with recording.formula(self, name):
-                    declared[name] = getattr(copy, name)
-            controls, absent = controls_of(self, declared.pop("modes"), declared.pop("controls"))
-            found = make_layout(type(self).__name__, controls=controls, absent=absent, **declared)
-            vars(self)["_cached_layout"] = found
-        return found
-
-    @property
     def mechanics(self) -> Mechanics:
         """The derived equations, as expressions."""
         if TWIN in vars(self):
@@ -232,41 +206,42 @@ class Scene(metaclass=SceneType):
             )
         found = vars(self).get("_cached_mechanics")
         if found is None:
-            found = motion.derive_motion(self, self._layout, recording.record(self, self._layout))
+            layout = layout_of(self)
+            found = motion.derive_motion(self, layout, recording.record_scene(self, layout))
             vars(self)["_cached_mechanics"] = found
         return found
 
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the state's entries, in order."""
-        return tuple(entry.name for entry in self._layout.state)
+        return tuple(entry.name for entry in layout_of(self).state)
 
     @property
     def state_units(self) -> tuple[str, ...]:
         """Units of the state's entries."""
-        return tuple(entry.unit for entry in self._layout.state)
+        return tuple(entry.unit for entry in layout_of(self).state)
 
     @property
     def control_names(self) -> tuple[str, ...]:
         """Names of the controls, in order."""
-        return self._layout.controls
+        return layout_of(self).controls
 
     @property
     def control_units(self) -> tuple[str, ...]:
         """Units of the controls."""
-        return self._layout.control_units
+        return layout_of(self).control_units
 
     # --- derived: numbers ----------------------------------------------------------------------------------
 
-    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
+    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[MotionPoint, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
         states, controls, shape = check_both(self, state, control)
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
-        return Point(self.mechanics, self._symbols(), y, u, Numeric), shape
+        return MotionPoint(self.mechanics, self._symbols(), y, u, Numeric), shape
 
     def _symbols(self) -> dict[Atom, Any]:
         """Return the parameters' values by symbol."""
-        return exactly({name: getattr(self, name) for name in self._numbers()})
+        return exactly(parameter_values(self))
 
     @_QUIET
     def acceleration(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
@@ -280,13 +255,13 @@ class Scene(metaclass=SceneType):
             The held controls; a single control may be given without its axis.
         """
         point, shape = self._point(state, control)
-        return {name: _shaped(point.acceleration[name], shape) for name in self._layout.free}
+        return {name: _shaped(point.acceleration[name], shape) for name in layout_of(self).free}
 
     @_QUIET
     def mass_matrix(self, state: ArrayLike, control: ArrayLike = 0.0) -> Array:
         """Return the mass matrix of the free coordinates, shape (..., n, n)."""
         point, shape = self._point(state, control)
-        n = len(self._layout.free)
+        n = len(layout_of(self).free)
         return np.stack([_shaped(x, shape) for x in point.mass], axis=-1).reshape(*shape, n, n)
 
     @_QUIET
@@ -304,11 +279,13 @@ class Scene(metaclass=SceneType):
             The held controls; they matter if a velocity depends on them.
         """
         point, shape = self._point(state, control)
-        names = self._layout.names
-        q = Values("coordinate", {name: Lanes(point.values[place(name)]) for name in names})
-        v = Values("velocity of a coordinate", {name: Lanes(point.values[velocity(name)]) for name in names})
-        given = self.kinetic(q, v, OfLanes), self.potential(q, OfLanes)
-        kinetic, potential = (x.value if isinstance(x, Lanes) else x for x in given)
+        names = layout_of(self).names
+        q = Values("coordinate", {name: LaneArray(point.values[place(name)]) for name in names})
+        v = Values(
+            "velocity of a coordinate", {name: LaneArray(point.values[velocity(name)]) for name in names}
+        )
+        given = self.kinetic(q, v, LaneArrayFunctions), self.potential(q, LaneArrayFunctions)
+        kinetic, potential = (x.value if isinstance(x, LaneArray) else x for x in given)
         energies = {"kinetic": kinetic, "potential": potential, "total": kinetic + potential}
         if self.mechanics.gyroscopic is not None:
             linear, rest = point.of(self.mechanics.gyroscopic)
@@ -331,7 +308,7 @@ class Scene(metaclass=SceneType):
             The held controls.
         """
         point, shape = self._point(state, control)
-        layout = self._layout
+        layout = layout_of(self)
         named = dict(layout.reactions)
         for p in layout.at("acceleration", "rate"):
             if p.name not in named.values():
@@ -375,74 +352,16 @@ class Scene(metaclass=SceneType):
         states, controls, shape = check_both(self, state, control)
         n = states.shape[-1]
         unit = np.eye(n + controls.shape[-1])
-        numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
-        numbers += [Dual(controls[..., i], unit[n + i]) for i in range(controls.shape[-1])]
-        point = Point(self.mechanics, self._symbols(), numbers[:n], numbers[n:], Carrying)
-        slopes = [rate.slope if isinstance(rate, Dual) else np.zeros(len(unit)) for rate in point.rates()]
+        numbers = [DualArray(states[..., i], unit[i]) for i in range(n)]
+        numbers += [DualArray(controls[..., i], unit[n + i]) for i in range(controls.shape[-1])]
+        point = MotionPoint(self.mechanics, self._symbols(), numbers[:n], numbers[n:], DualArrayFunctions)
+        slopes = [
+            rate.slope if isinstance(rate, DualArray) else np.zeros(len(unit)) for rate in point.rates()
+        ]
         both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
         return both[..., :n].copy(), both[..., n:].copy()
 
     # --- derived: steps ------------------------------------------------------------------------------------
-
-    @property
-    def _stepper(self) -> SeriesStepper:
-        from lag_envs.stepping.general import stepper_of
-
-        return stepper_of(self.mechanics)
-
-    @property
-    def _lagged(self) -> LaggedStepper:
-        """The stepper for lagged controls, also of scenes with a closed form."""
-        from lag_envs.stepping.lag import lagged_stepper
-
-        return lagged_stepper(self.mechanics)
-
-    @property
-    def _form(self) -> NormalForm | None:
-        """The equation of motion's normal form if it has an exact flow of its own, else None."""
-        from lag_envs.stepping.normal_forms import normal_form
-
-        return normal_form(self.mechanics)
-
-    def _constants(self, lagged: bool = False) -> dict[str, float]:
-        """Return the numbers that a step needs, computed from the parameters."""
-        kept = "_cached_lagged_constants" if lagged else "_cached_constants"
-        found = vars(self).get(kept)
-        if found is None:
-            source = self._lagged if lagged else self._form or self._stepper
-            found = source.constants({name: getattr(self, name) for name in self._numbers()})
-            for name, value in found.items():
-                if not math.isfinite(value):
-                    raise ValueError(
-                        f"these parameters make a coefficient of the motion, {name}, {value}: {self}"
-                    )
-            vars(self)[kept] = found
-        return found
-
-    def _order(self, dt: float, lagged: bool = False) -> int:
-        """Return the order of the series for a control step; 0 for a closed form, which is never lagged."""
-        if self._form and not lagged:
-            return self._form.order(dt)
-        return self._series_order(dt)
-
-    def _series_order(self, dt: float) -> int:
-        """Return the order of the general series for a control step."""
-        from lag_envs.stepping.general import usual_order
-
-        return vars(self).get(ORDER) or usual_order(dt)
-
-    def _limit(self, dt: float, lagged: bool = False) -> float:
-        """Return the argument of a step besides dt: the largest x of one series, or the series' order."""
-        if self._form and not lagged:
-            return self._form.largest_majorant(dt)
-        return float(self._order(dt, lagged))
-
-    def _code(self, dt: float, lagged: bool = False) -> Any:
-        """Return the code of a control step."""
-        absent = frozenset(name for name, value in self._constants(lagged).items() if value == 0.0)
-        if lagged:
-            return self._lagged.code(absent)
-        return self._form.stepper(dt, absent) if self._form else self._stepper.code(absent)
 
     def simulate(
         self,
@@ -628,16 +547,6 @@ class Scene(metaclass=SceneType):
         """
         return steps.vjp(self, state, control, dt, cotangent, parameters)
 
-    def _mechanics_by(self, parameters: tuple[str, ...]) -> Mechanics:
-        """Return the equations of motion with these parameters kept in them, even if they are 0."""
-        if not set(parameters) & set(self.mechanics.zeros):
-            return self.mechanics
-        known = vars(self).setdefault("_cached_mechanics_by", {})
-        if parameters not in known:
-            record = recording.record(self, self._layout)
-            known[parameters] = motion.derive_motion(self, self._layout, record, parameters)
-        return known[parameters]
-
     def fit(
         self,
         recordings: Sequence[tuple[ArrayLike, ArrayLike | int | None, float]],
@@ -695,9 +604,9 @@ class Scene(metaclass=SceneType):
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: parameters, state, controls, equations."""
-        from lag_envs.scenes.html import described
+        from lag_envs.scenes.html import scene_html
 
-        return described(self)
+        return scene_html(self)
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.mechanics.recording import parameter_names
+
 Array = NDArray[np.float64]
 
 #: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must
@@ -66,7 +68,7 @@ def real_array(name: str, values: ArrayLike) -> Array:
 
 
 def is_masked(values: Any) -> bool:
-    """Tell whether values are or hold a masked array; NumPy would take masked numbers for valid ones."""
+    """Return whether values are or hold a masked array; NumPy would take masked numbers for valid ones."""
     if isinstance(values, list | tuple):
         return any(map(is_masked, values))
     return isinstance(values, np.ndarray) and hasattr(values, "mask")
@@ -162,7 +164,7 @@ def check_sequence(scene: Any, controls: ArrayLike | int) -> Array:
 
 def check_parameters(scene: Any, parameters: Sequence[str]) -> tuple[str, ...]:
     """Return names of parameters as a tuple, or raise a ValueError for one that the scene lacks."""
-    names = scene._numbers()
+    names = parameter_names(scene)
     if isinstance(parameters, str):
         raise ValueError(f"parameters must be a sequence of names, such as [{parameters!r}]; got a string")
     found = tuple(parameters)

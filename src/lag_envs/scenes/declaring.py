@@ -64,7 +64,7 @@ def complete(cls: type) -> None:
                 del sys.modules[cls.__module__]
 
 
-def declare(cls: Any, meta: type[type]) -> None:
+def declare_scene(cls: Any, meta: type[type]) -> None:
     """Prepare a new class of scenes: copy its mappings, and note faults in its names.
 
     Parameters

@@ -14,24 +14,26 @@ import numpy as np
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.evaluation import Exact, Numeric
-from lag_envs.mechanics.layout import Layout, check_name
+from lag_envs.mechanics.layout import SceneLayout, check_name
 from lag_envs.mechanics.motion import Mechanics
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import picture
 from lag_envs.scenes.checks import shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
+from lag_envs.scenes.derivation import layout_of, structure_of
 from lag_envs.scenes.parameters import fill_in
 
 #: A mass matrix whose smallest eigenvalue is below this, its diagonal scaled to 1, counts as singular.
 SINGULAR = 1e-13
 
-#: Layouts and equations of scenes that passed the checks: by class, and by `Scene._structure`.
-_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
+#: Layouts and equations of scenes that passed the checks: by class, and by `structure_of`.
+_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[SceneLayout, Mechanics]]] = (
     weakref.WeakKeyDictionary()
 )
 
 
 def is_own(kind: type) -> bool:
-    """Tell whether a class is the package's own: then its structure alone decides its formulas' results.
+    """Return whether a class is the package's own: then its structure alone decides its formulas' results.
 
     Other people's formulas may use names defined outside, which can change.
     """
@@ -55,7 +57,7 @@ def admit(scene: Any, base: type) -> None:
     fill_in(scene)
     scene.check()
     try:
-        key = scene._structure
+        key = structure_of(scene)
         known = _admitted.setdefault(type(scene), {}).get(key)
     except TypeError as error:
         raise FormulaError(f"{type(scene).__name__}: {error}; structural fields must be hashable") from error
@@ -63,10 +65,11 @@ def admit(scene: Any, base: type) -> None:
         vars(scene)["_cached_layout"], vars(scene)["_cached_mechanics"] = known
     elif known is None:
         _check_names(scene, base)
-        recording.check_again(scene, scene._layout, recording.record(scene, scene._layout))
+        layout = layout_of(scene)
+        recording.check_again(scene, layout, recording.record_scene(scene, layout))
         _check_motion(scene, scene.mechanics)
         _check_bodies(scene)
-        _admitted[type(scene)][key] = scene._layout, scene.mechanics
+        _admitted[type(scene)][key] = layout, scene.mechanics
 
 
 def check_class(cls: type, base: type) -> None:
@@ -97,7 +100,7 @@ def _check_names(scene: Any, base: type) -> None:
         for name in (*own_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
                 raise FormulaError(f"{of}.{name} hides an attribute of every scene; choose another name")
-    layout = scene._layout
+    layout = layout_of(scene)
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {
         **dict.fromkeys(DEFINED, "part of every scene"),
@@ -152,7 +155,7 @@ def _check_motion(scene: Any, found: Mechanics) -> None:
 def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> float:
     """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, at its largest."""
     n = len(found.free)
-    values = {recording.parameter(name): number(getattr(scene, name)) for name in scene._numbers()}
+    values = {recording.parameter(name): number(getattr(scene, name)) for name in parameter_names(scene)}
     generator = np.random.default_rng(11)
     symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
     seen = []

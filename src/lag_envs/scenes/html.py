@@ -9,18 +9,20 @@ from html import escape
 from importlib.util import find_spec
 from typing import Any
 
+from lag_envs.scenes.derivation import layout_of
+
 #: Operations of a Lagrangian up to which its equations of motion are written out.
 LONGEST = 150
 
 
-def table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
+def html_table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
     """Return rows of text as a table; the text of each cell is escaped."""
     lines = [f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>"] if head else []
     lines += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
     return f"<table>{''.join(lines)}</table>"
 
 
-def parameters(scene: Any) -> list[tuple[str, str]]:
+def parameter_rows(scene: Any) -> list[tuple[str, str]]:
     """Return names and values of a scene's parameters and structural fields."""
     rows = []
     for field in dataclasses.fields(scene):
@@ -30,7 +32,7 @@ def parameters(scene: Any) -> list[tuple[str, str]]:
     return rows
 
 
-def described(scene: Any) -> str:
+def scene_html(scene: Any) -> str:
     """Return a scene's HTML for a notebook."""
     state = ", ".join(
         f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True)
@@ -41,8 +43,8 @@ def described(scene: Any) -> str:
     about = (inspect.getdoc(type(scene)) or "").partition("\n")[0]
     rows = [("State", state), ("Controls", controls or "none")]
     return (
-        f"<div><b>{escape(type(scene).__name__)}</b> {escape(about)}{table(rows)}"
-        f"{table(parameters(scene), ('parameter', 'value'))}{_equations(scene)}</div>"
+        f"<div><b>{escape(type(scene).__name__)}</b> {escape(about)}{html_table(rows)}"
+        f"{html_table(parameter_rows(scene), ('parameter', 'value'))}{_equations(scene)}</div>"
     )
 
 
@@ -60,9 +62,9 @@ def _equations(scene: Any) -> str:
         code = "<code>lag_envs.scenes.symbolic.equations(scene)</code>"
         return "".join([*found, f"<p>Its equations of motion are long: {code}</p>"])
     found.append("<p>Equations of motion</p>")
-    q = symbolic.motion(scene)[0]
-    rates = [q[name].diff(symbolic.t, 2) for name in scene._layout.names]
-    for name in scene._layout.free:
+    q = symbolic.motion_symbols(scene)[0]
+    rates = [q[name].diff(symbolic.t, 2) for name in layout_of(scene).names]
+    for name in layout_of(scene).free:
         equation = sympy.expand(symbolic.euler_lagrange(scene, name))
         squares = {
             power: 1 - sympy.cos(power.base.args[0]) ** 2

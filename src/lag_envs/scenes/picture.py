@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import Expr, FormulaError
 from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.mechanics.recording import Values, formula
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.shapes import Frame, Pose, Shape, Window, extent, placed
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class Picture:
         held[1:] = np.reshape(controls, held[1:].shape)
         # Exact if the rates are linear between two states, as for a coordinate with held acceleration.
         turned = []
-        for rate in turning(self._scene, columns):
+        for rate in left_out_rates(self._scene, columns):
             rates = np.broadcast_to(rate, n)
             turned.append(np.concatenate([[0.0], np.cumsum(0.5 * dt * (rates[1:] + rates[:-1]))]))
         now = Frame(columns, list(held.T), self._of.share(list(held.T)), target, turned)
@@ -207,9 +208,9 @@ def at_rest(scene: Scene) -> Now:
     )
 
 
-def turning(scene: Scene, state: Sequence[Any]) -> tuple[Any, ...]:
+def left_out_rates(scene: Scene, state: Sequence[Any]) -> tuple[Any, ...]:
     """Return the rates of the places that the state leaves out, in order; unknown ones are 0."""
-    layout = scene._layout
+    layout = layout_of(scene)
     rates = {entry.coordinate: state[i] for i, entry in enumerate(layout.state) if entry.kind == "velocity"}
     return tuple(rates.get(name, 0.0) for name in layout.left_out if name in layout.names)
 
@@ -222,7 +223,7 @@ def _filled(names: Sequence[str], given: Any) -> dict[str, Any]:
 
 def places(scene: Scene, now: Frame) -> dict[str, Any]:
     """Return the places of all coordinates."""
-    layout = scene._layout
+    layout = layout_of(scene)
     controls = _filled(layout.controls, now.control)
     turned = _filled([name for name in layout.left_out if name in layout.names], now.turned)
     rests = scene.rests()
@@ -246,7 +247,7 @@ def _reach(scene: Scene) -> float:
     A coordinate that occurs in the poses only in sines and cosines counts as an angle, any other as a length,
     which is followed as far as the bodies are large.
     """
-    names, record = scene._layout.names, scene.mechanics.record.poses
+    names, record = layout_of(scene).names, scene.mechanics.record.poses
     sizes = {body: extent(outline) for body, outline in scene.bodies().items() if body in record}
     lengths = {s.name for x, y, *_ in record.values() for s in _plain(x) | _plain(y)}
     generator, far = np.random.default_rng(5), 0.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes.checks import (
     StepRefused,
     check_applied,
@@ -21,6 +22,16 @@ from lag_envs.scenes.checks import (
     check_state,
     check_step,
     real_array,
+)
+from lag_envs.scenes.derivation import (
+    code_of,
+    form_of,
+    layout_of,
+    mechanics_with,
+    motion_constants_of,
+    order_of,
+    series_order_of,
+    step_argument_of,
 )
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -49,8 +60,8 @@ def simulate(
         each = np.concatenate([given, np.broadcast_to(decays, given.shape)], axis=1)
     trajectory = np.empty((len(given) + 1, len(start)))
     trajectory[0] = start
-    code = scene._code(dt, lagged)
-    row = code.simulation(trajectory, each, dt, scene._limit(dt, lagged), *_numbers(scene, code, lagged))
+    code, argument = code_of(scene, dt, lagged), step_argument_of(scene, dt, lagged)
+    row = code.simulation(trajectory, each, dt, argument, *_numbers(scene, code, lagged))
     if not row and not np.isfinite(trajectory[-1]).all():
         row = int(np.argmin(np.isfinite(trajectory).all(axis=1)))
     if lagged:
@@ -78,7 +89,7 @@ def _lagging(scene: Scene, lag: Any, applied: Any, dt: float) -> tuple[Array | N
 
 def _numbers(scene: Scene, code: Any, lagged: bool) -> list[float]:
     """Return the constants that the step's code takes."""
-    constants = scene._constants(lagged)
+    constants = motion_constants_of(scene, lagged)
     return [constants[name.removeprefix("k_")] for name in code.constants]
 
 
@@ -97,16 +108,17 @@ def step_bound(
     held = check_controls(scene, control, 1).reshape(-1)
     decays, reached = _lagging(scene, lag, applied, dt)
     lagged = decays is not None
-    if scene._form and not lagged:
-        return scene._form.step_bound(start, list(held), dt, scene._constants())
-    code, order = scene._code(dt, lagged), scene._order(dt, lagged)
+    if not lagged and (form := form_of(scene)):
+        return form.step_bound(start, list(held), dt, motion_constants_of(scene))
+    code, order = code_of(scene, dt, lagged), order_of(scene, dt, lagged)
     given = held.tolist() if decays is None else [*reached.tolist(), *held.tolist(), *decays.tolist()]
     status, bounds = code.bounded(start.tolist(), given, dt, order, _numbers(scene, code, lagged))
     if status < 0:
         raise refusal(scene, start, held, dt, None, "the step", lagged=lagged)
-    of = {("place", name): bounds[0][i] for i, name in enumerate(scene._layout.free)}
-    of |= {("velocity", name): bounds[1][i] for i, name in enumerate(scene._layout.free)}
-    by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in scene._layout.state}
+    layout = layout_of(scene)
+    of = {("place", name): bounds[0][i] for i, name in enumerate(layout.free)}
+    of |= {("velocity", name): bounds[1][i] for i, name in enumerate(layout.free)}
+    by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in layout.state}
     return StepBound(status, order, by_state, "proved with the step")
 
 
@@ -198,8 +210,8 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     from lag_envs.stepping.general import stepper_of
     from lag_envs.stepping.normal_forms import normal_form
 
-    mechanics = scene._mechanics_by(by)
-    form, numbers = normal_form(mechanics), {name: getattr(scene, name) for name in scene._numbers()}
+    mechanics = mechanics_with(scene, by)
+    form, numbers = normal_form(mechanics), parameter_values(scene)
     try:
         if form:
             constants, rates = form.constants(numbers), form.rates(numbers, by)
@@ -210,8 +222,8 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
         else:
             tangent = stepper_of(mechanics).tangent(numbers, by)
             known[by] = _Derivatives(
-                lambda y, u, dt: tangent.jacobian(y, u, dt, scene._series_order(dt)),
-                lambda y, u, dt, seeds: tangent.vjp(y, u, dt, scene._series_order(dt), seeds),
+                lambda y, u, dt: tangent.jacobian(y, u, dt, series_order_of(scene, dt)),
+                lambda y, u, dt, seeds: tangent.vjp(y, u, dt, series_order_of(scene, dt), seeds),
             )
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
@@ -257,7 +269,7 @@ def refusal(
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
     held = zip(scene.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
     why = "it could not be certified within the largest number of substeps"
-    if scene._form is not None and not lagged:
+    if form_of(scene) is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
     error = StepRefused(
         f"{where} was refused: from ({start}) with "

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import sympy
 from sympy.core.function import AppliedUndef
 
-from lag_envs.mechanics.algebra import FormulaError, Functions
-from lag_envs.mechanics.recording import Values, twin
+from lag_envs.mechanics.algebra import FormulaError, RecordedFunctions
+from lag_envs.mechanics.recording import Values, parameter_names, twin
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.parameters import parameter
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def symbolic(scene: Scene) -> Any:
     """Return a twin of the scene whose parameters are symbols with their names."""
     ranges = {f.name: f.metadata for f in dataclasses.fields(scene)}  # type: ignore[arg-type]
     symbols = {}
-    for name in scene._numbers():
+    for name in parameter_names(scene):
         positive = any(
             ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least")
         )
@@ -73,9 +74,9 @@ def symbolic(scene: Scene) -> Any:
     return twin(scene, symbols)
 
 
-def motion(scene: Scene) -> tuple[Values, Values, Values]:
+def motion_symbols(scene: Scene) -> tuple[Values, Values, Values]:
     """Return places, velocities and controls as SymPy's functions of time."""
-    layout = scene._layout
+    layout = layout_of(scene)
     q: dict[str, Any] = {name: sympy.Function(name, real=True)(t) for name in layout.names}
     u = {name: sympy.Function(name, real=True)(t) for name in layout.controls}
     return (
@@ -89,14 +90,14 @@ def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
     """Return an expression with resting coordinates at their resting places."""
     values: dict[Any, Any] = {}
     rests = symbolic(scene).rests()
-    for p in scene._layout.at("rest"):
+    for p in layout_of(scene).at("rest"):
         place = sympy.Function(p.name, real=True)(t)
         values |= {place: xp.rational(rests.get(p.name, 0)), place.diff(t): 0, place.diff(t, 2): 0}
     return expression.xreplace({key: sympy.sympify(value) for key, value in values.items()})
 
 
 def _lagrangian(scene: Scene, xp: Any) -> sympy.Expr:
-    copy, (q, v, _) = symbolic(scene), motion(scene)
+    copy, (q, v, _) = symbolic(scene), motion_symbols(scene)
     return xp.rational(copy.kinetic(q, v, xp) - copy.potential(q, xp))
 
 
@@ -117,7 +118,7 @@ def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.E
     xp : namespace, default `Symbolic`
         Functions of SymPy's expressions; with `Exact` the formulas' floats keep their exact values.
     """
-    copy, (q, v, u) = symbolic(scene), motion(scene)
+    copy, (q, v, u) = symbolic(scene), motion_symbols(scene)
     of, rate, energy = q[coordinate], v[coordinate], _lagrangian(scene, xp)
     loss = xp.rational(copy.dissipation(q, v, u, xp))
     force = xp.rational(copy.applied(q, v, u, xp).get(coordinate, 0))
@@ -126,7 +127,7 @@ def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.E
 
 def equations(scene: Scene) -> list[sympy.Eq]:
     """Return the equations of motion of the free coordinates; `sympy.latex` prints them."""
-    return [sympy.Eq(sympy.simplify(euler_lagrange(scene, name)), 0) for name in scene._layout.free]
+    return [sympy.Eq(sympy.simplify(euler_lagrange(scene, name)), 0) for name in layout_of(scene).free]
 
 
 # --- expressions as a scene --------------------------------------------------------------------------------
@@ -189,16 +190,19 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
         return {symbol: getattr(spaces[of], key) for symbol, (of, key) in places.items() if of in spaces}
 
     def kinetic(self: Any, q: Any, v: Any, xp: Any) -> Any:
-        return evaluate(expressions["kinetic"], numbers(self, q=q, v=v), xp)
+        return evaluate_expression(expressions["kinetic"], numbers(self, q=q, v=v), xp)
 
     def potential(self: Any, q: Any, xp: Any) -> Any:
-        return evaluate(expressions["potential"], numbers(self, q=q), xp)
+        return evaluate_expression(expressions["potential"], numbers(self, q=q), xp)
 
     def dissipation(self: Any, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        return evaluate(expressions["dissipation"], numbers(self, q=q, v=v, u=u), xp)
+        return evaluate_expression(expressions["dissipation"], numbers(self, q=q, v=v, u=u), xp)
 
     def forces(self: Any, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        return {key: evaluate(force, numbers(self, q=q, v=v, u=u), xp) for key, force in applied.items()}
+        return {
+            key: evaluate_expression(force, numbers(self, q=q, v=v, u=u), xp)
+            for key, force in applied.items()
+        }
 
     def reduce(self: Any) -> Any:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -236,7 +240,7 @@ def _name(symbol: Any) -> str:
     raise FormulaError(f"{symbol!r} is neither a SymPy symbol nor a function of time; it cannot be a name")
 
 
-def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
+def evaluate_expression(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     """Return the value of a SymPy expression for numbers of any kind.
 
     Parameters
@@ -248,13 +252,13 @@ def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     xp : namespace
         Functions for these numbers.
     """
-    of: Callable[[Any], Any] = lambda e: evaluate(e, values, xp)  # noqa: E731
+    of: Callable[[Any], Any] = lambda e: evaluate_expression(e, values, xp)  # noqa: E731
     if expression in values:
         return values[expression]
     if expression.is_Integer:
         return int(expression)
     if expression.is_Rational:
-        exact = isinstance(xp, Functions)
+        exact = isinstance(xp, RecordedFunctions)
         return Fraction(expression.p, expression.q) if exact else expression.p / expression.q
     if expression.is_number and expression.is_real:
         return float(expression)

@@ -21,7 +21,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.tracing import BOOLEAN, Number, Operation, Trace
+from lag_envs.stepping.tracing import BOOLEAN, Operation, Trace, TracedNumber
 
 #: Lanes whose numbers lie together: few enough that all inputs and outputs fit into the nearest cache.
 LANES = 64
@@ -31,7 +31,7 @@ def _whole(name: str) -> Callable:
     function = getattr(math, name)
 
     def of(self: Differentiable, a: Any) -> Any:
-        return self.record(name, a) if isinstance(a, Number) else function(a)
+        return self.record(name, a) if isinstance(a, TracedNumber) else function(a)
 
     of.__doc__ = f"Return {name} of a number."
     return of
@@ -47,7 +47,7 @@ class Differentiable(Trace):
         """Return the tangent."""
         return self.sin(a) / self.cos(a)
 
-    def adjoint(self, outputs: Sequence[Any], seeds: Sequence[Any], inputs: Sequence[Number]) -> list:
+    def adjoint(self, outputs: Sequence[Any], seeds: Sequence[Any], inputs: Sequence[TracedNumber]) -> list:
         """Record and return Σ seed ∂output/∂input for each input.
 
         Parameters
@@ -63,12 +63,12 @@ class Differentiable(Trace):
         total: dict[str, Any] = {}
 
         def pass_on(to: Any, amount: Any) -> None:
-            if isinstance(to, Number):
+            if isinstance(to, TracedNumber):
                 total[to.name] = total.get(to.name, 0.0) + amount
 
         for output, seed in zip(outputs, seeds, strict=True):
             pass_on(output, seed)
-        nodes = self._between(outputs, {x.name for x in inputs if isinstance(x, Number)})
+        nodes = self._between(outputs, {x.name for x in inputs if isinstance(x, TracedNumber)})
         branches = self._branches(nodes)
         for node in reversed(nodes):
             seed = total.pop(node.name, None)
@@ -78,19 +78,19 @@ class Differentiable(Trace):
                 if node.name in branches and node.op not in ("+", "-", "neg", "where"):
                     amount = self.where(0.0 < self.abs(seed), amount, 0.0)
                 pass_on(operand, amount)
-        return [total.get(x.name, 0.0) if isinstance(x, Number) else 0.0 for x in inputs]
+        return [total.get(x.name, 0.0) if isinstance(x, TracedNumber) else 0.0 for x in inputs]
 
-    def _between(self, outputs: Sequence[Any], inputs: set[str]) -> list[Number]:
+    def _between(self, outputs: Sequence[Any], inputs: set[str]) -> list[TracedNumber]:
         """Return the operations from these inputs to these outputs, in order."""
         needed, stack = set(inputs), list(outputs)
         while stack:
             value = stack.pop()
-            if isinstance(value, Number) and value.name not in needed:
+            if isinstance(value, TracedNumber) and value.name not in needed:
                 needed.add(value.name)
                 stack.extend(value.args)
         return [node for node in self._nodes if node.name in needed - inputs]
 
-    def _shares(self, node: Number, seed: Any) -> list[tuple[Any, Any]]:
+    def _shares(self, node: TracedNumber, seed: Any) -> list[tuple[Any, Any]]:
         """Return an operation's operands, each with its share of the cotangent."""
         a, b, c = (*node.args, None, None)[:3]
         if node.op == "where":
@@ -118,16 +118,16 @@ class Differentiable(Trace):
         return [(a, rule())]
 
     @staticmethod
-    def _branches(nodes: Sequence[Number]) -> set[str]:
+    def _branches(nodes: Sequence[TracedNumber]) -> set[str]:
         """Return the operations that lead into branches of a selection: their numbers may be anything."""
         found: set[str] = set()
         for node in reversed(nodes):
             operands = node.args[1:] if node.op == "where" else node.args if node.name in found else ()
-            found |= {a.name for a in operands if isinstance(a, Number)}
+            found |= {a.name for a in operands if isinstance(a, TracedNumber)}
         return found
 
 
-def replay(operations: Sequence[Operation], values: Mapping[str, Any], trace: Trace) -> dict[str, Any]:
+def rerun(operations: Sequence[Operation], values: Mapping[str, Any], trace: Trace) -> dict[str, Any]:
     """Carry out operations on the numbers of another recording; return all results by name."""
     known = dict(values)
     for name, op, args in operations:
@@ -137,7 +137,7 @@ def replay(operations: Sequence[Operation], values: Mapping[str, Any], trace: Tr
     return known
 
 
-class Lanes:
+class LaneFormula:
     """A formula, compiled to be carried out for each lane of a batch.
 
     Parameters
@@ -171,7 +171,7 @@ class Lanes:
         found = formula(trace, numbers)
         operations, results = trace.operations([x for numbers in found for x in numbers])
         target = ElementaryTrace()
-        known = replay(operations, {n: target.inputs(n)[0] for n in numbers if n not in absent}, target)
+        known = rerun(operations, {n: target.inputs(n)[0] for n in numbers if n not in absent}, target)
         ends = [known[result] if isinstance(result, str) else float(result) for result in results]
         lines, values = record_block(target, {f"out{i}": end for i, end in enumerate(ends)})
         used = set(re.findall(r"\w+", " ".join([*lines, *map(str, values)])))

@@ -1,11 +1,11 @@
-"""The step of `lag_envs.stepping.series` backwards: gradients by its end as gradients by its start.
+"""The step of `lag_envs.stepping.series` backwards: from gradients by its end to gradients by its start.
 
-The series that ends a control step is at hand, those of earlier substeps are expanded once more. Then the
-recurrences are gone through from the highest order to the lowest. Each is a relation that is linear in the
-coefficient it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent
-P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
-Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them where the series has one. Lengths of
-substeps are held.
+The series that ends a control step is still available; those of earlier substeps are expanded again. Then the
+recurrences are traversed from the highest order to the lowest. Each is a relation that is linear in the
+coefficient that it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The
+cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
+Σ_{k>j} P_k B_{k-j} that of A_j. So an order costs two of them where the series has one. The lengths of the
+substeps are held fixed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
-from lag_envs.stepping.series import GROUP, STRIDE, Factor, Lane, Series, Start, Target, times
+from lag_envs.stepping.matrices import matrix_times
+from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress
+from lag_envs.stepping.target import GROUP, Target
 
 
 class Backward(Series):
@@ -38,20 +40,20 @@ class Backward(Series):
         del self.slots  # more series are needed than for the step
         for i in range(self.size):
             self._slot("a", i)
-        for n in self._live:
+        for n in self.live:
             node = record.nodes[n]
             if node.op == "sum":
                 for a, w in zip(node.args, node.weights, strict=False):
                     if w in self._active:
-                        self._factor(a)
-        self.slots = len(self._slots)
+                        self.factor_of(a)
+        self.slots = len(self.slot_of)
         #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to
         #: which several orders add, or which are known, and so wanted at the end.
-        self._sums = {key: self.slots + i for i, key in enumerate(self._pairs)}
-        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self._pairs.values() if a.back}
+        self._sums = {key: self.slots + i for i, key in enumerate(self.pairs)}
+        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self.pairs.values() if a.back}
         kept = [
             slot
-            for (kind, i), slot in self._slots.items()
+            for (kind, i), slot in self.slot_of.items()
             if kind == "v" or slot in rates or self._is_known(kind, i)
         ]
         self._bars = {slot: first + i for i, slot in enumerate(kept)}
@@ -73,12 +75,12 @@ class Backward(Series):
         self,
         t: Any,
         inputs: dict[str, Any],
-        lane: Lane,
+        lane: StepProgress,
         dt: Any,
         order: Any,
         tolerance: Any,
         bars: Sequence,
-    ) -> tuple[Lane, list, Any]:
+    ) -> tuple[StepProgress, list, Any]:
         """Take a substep like `substep`; in lanes where it ends the control step, also take it backwards.
 
         Parameters
@@ -113,7 +115,7 @@ class Backward(Series):
             return [*after.q, *after.v, *after[2:]]
 
         after = t.when(t.negated(t.all(again)), certify, [*lane.q, *lane.v, *lane[2:]])
-        lane = Lane(after[:n], after[n : 2 * n], *after[2 * n :])
+        lane = StepProgress(after[:n], after[n : 2 * n], *after[2 * n :])
         ended = t.either(again, t.both(wanted, t.negated(t.less(zero, lane.left))))
         back = t.most(ended, wanted)
 
@@ -123,7 +125,7 @@ class Backward(Series):
 
         return lane, t.when(back, go_back, bars), back
 
-    def _back(self, t: Target, start: Start, h: Any, order: Any, ends: Sequence) -> list:
+    def _back(self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list:
         """Return cotangents before the step just expanded from those after it, see `pull`."""
         self._clear(t, order)
         n = self.size
@@ -150,23 +152,25 @@ class Backward(Series):
         sources = zip(self._sources, ends[2 * n :], strict=True)
         return found + [self._of_source(t, start, weights, source, total) for source, total in sources]
 
-    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str, total: Any) -> Any:
+    def _of_source(
+        self, t: Target, start: ExpansionStart, weights: dict[str, Any], source: str, total: Any
+    ) -> Any:
         for name, bar in weights.items():
             slope = self.record.tangents[name].get(source, 0.0)
             if slope != 0.0:
-                total = t.fma(bar, self._weight(t, start.scalars, slope), total)
+                total = t.fma(bar, self.weight(t, start.scalars, slope), total)
         return total
 
     # --- cotangents in memory ------------------------------------------------------------------------------
 
     def _bar(self, kind: str, i: int) -> int:
-        return self._bars[self._slots[kind, i]]
+        return self._bars[self.slot_of[kind, i]]
 
     def _clear(self, t: Target, order: Any) -> None:
         zero = t.number(0.0)
 
         def clear(k: Any, carried: Sequence) -> list:
-            for (kind, _), slot in self._slots.items():
+            for (kind, _), slot in self.slot_of.items():
                 if kind == "x" and slot in self._bars:
                     t.store(self._bars[slot], k, zero)
             return []
@@ -195,7 +199,7 @@ class Backward(Series):
         To those that are kept in slots it is added there.
         """
         found: dict[Factor, Any] = {}
-        pairs = list(self._pairs.items())
+        pairs = list(self.pairs.items())
         for begin in range(0, len(pairs), GROUP):
             some = pairs[begin : begin + GROUP]
 
@@ -220,18 +224,18 @@ class Backward(Series):
                 self._add(t, self._bars[factor.slot], t.plus(k, -factor.back), t.number(1.0), total)
         return found
 
-    def _solve_back(self, t: Target, start: Start, h: Any, k: Any, found: dict[Factor, Any]) -> list:
+    def _solve_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, found: dict[Factor, Any]) -> list:
         """Go back through M_0 a_k = r and v_{k+1} = h a_k/(k+1); return the cotangents of r."""
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
         a, bars = [], []
         for i in range(self.size):
-            slot = self._slots["a", i]
+            slot = self.slot_of["a", i]
             a.append(t.load(slot, k))
             v_bar = t.load(self._bar("v", i), after)
             own = found.get(Factor(slot))
             bars.append(t.mul(step, v_bar) if own is None else t.fma(step, v_bar, own))
-        right = [t.number(0.0) if x is None else x for x in times(t, start.inverse.rows, bars)]
+        right = [t.number(0.0) if x is None else x for x in matrix_times(t, start.inverse.rows, bars)]
         for i, j in self.record.mass:
             less = t.mul(right[i], a[j])
             less = less if i == j else t.fma(right[j], a[i], less)
@@ -239,18 +243,18 @@ class Backward(Series):
             t.store(*cell, t.sub(t.load(*cell), less))
         return right
 
-    def _one_order_back(self, t: Target, start: Start, h: Any, k: Any, order: Any) -> None:
+    def _one_order_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, order: Any) -> None:
         """Take the cotangents of all coefficients of order k > 0 to those of lower ones."""
         record, first = self.record, t.index(0)
         found = self._gather(t, k, order)
         bars: dict[int, Any] = {}
-        for n in self._live:
-            slot = self._slots.get(("x", n), -1)
+        for n in self.live:
+            slot = self.slot_of.get(("x", n), -1)
             if slot in self._bars and record.nodes[n].op not in KNOWN:
                 bars[n] = t.load(self._bars[slot], k)
             elif Factor(slot) in found:
                 bars[n] = found[Factor(slot)]
-            if ("d", n) in self._slots and (bar := found.get(Factor(self._slots["d", n]))) is not None:
+            if ("d", n) in self.slot_of and (bar := found.get(Factor(self.slot_of["d", n]))) is not None:
                 more = t.mul(t.real(k), bar)
                 bars[n] = t.add(bars[n], more) if n in bars else more
 
@@ -266,21 +270,23 @@ class Backward(Series):
             if node < 0:
                 continue
             for i, j in {(a, b), (b, a)}:
-                rate, factor = Factor(self._slots["a", j]), self._factor(node)
+                rate, factor = Factor(self.slot_of["a", j]), self.factor_of(node)
                 less = t.neg(right[i])
                 if weight in self._active:
                     self._weight_bar(t, weight, less, self._product(t, k, factor, rate))
                 if weight != 1.0:
-                    less = t.mul(less, self._weight(t, start.scalars, weight))
+                    less = t.mul(less, self.weight(t, start.scalars, weight))
                 add(node, less, rate.load(t, first))
                 t.store(self._sums[i, j], k, less)
-        for n in reversed(self._live):
+        for n in reversed(self.live):
             if n in bars:
                 self._node_back(t, start, n, bars[n], h, k, add)
-            elif n in self._pairs:
+            elif n in self.pairs:
                 t.store(self._sums[n], k, t.number(0.0))
 
-    def _node_back(self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable) -> None:
+    def _node_back(
+        self, t: Target, start: ExpansionStart, n: int, bar: Any, h: Any, k: Any, add: Callable
+    ) -> None:
         """Take a node's cotangent of order k to what it was made of, and to its sum of products."""
         node, zero = self.record.nodes[n], start.zero
         op, args = node.op, node.args
@@ -288,12 +294,12 @@ class Backward(Series):
             step = t.mul(h, t.reciprocal(k))
             self._add(t, self._bar("v", node.index), t.plus(k, -1), step, bar)
         elif op == "velocity" or op in KNOWN:
-            self._add(t, self._bars[self._factor(n).slot], k, bar, t.number(1.0))
+            self._add(t, self._bars[self.factor_of(n).slot], k, bar, t.number(1.0))
         elif op == "sum":
             for a, weight in zip(args, node.weights, strict=False):
-                add(a, bar, self._weight(t, start.scalars, weight))
+                add(a, bar, self.weight(t, start.scalars, weight))
                 if weight in self._active:
-                    self._weight_bar(t, weight, bar, self._factor(a).load(t, k))
+                    self._weight_bar(t, weight, bar, self.factor_of(a).load(t, k))
         elif op == "product":
             add(args[0], bar, zero[args[1]])
             add(args[1], bar, zero[args[0]])
@@ -308,7 +314,7 @@ class Backward(Series):
             t.store(self._sums[n], k, t.neg(half))
         else:  # k z_k = Σ_{j>0} D_j w_{k-j}
             assert op in FUNCTIONS
-            slope = self._slope(n)
+            slope = self.slope_of(n)
             bar = t.neg(bar) if op == "cos" else bar
             scaled = t.mul(t.reciprocal(k), bar)
             if slope.back:  # D is h times the argument's rate
@@ -329,12 +335,14 @@ class Backward(Series):
 
     # --- order 0 -------------------------------------------------------------------------------------------
 
-    def _first_order_back(self, t: Target, start: Start, h: Any, order: Any) -> tuple[list, dict[str, Any]]:
+    def _first_order_back(
+        self, t: Target, start: ExpansionStart, h: Any, order: Any
+    ) -> tuple[list, dict[str, Any]]:
         """Return cotangents of places and velocities (None: zero), and of the active weights."""
         record, zero, first, n = self.record, start.zero, t.index(0), self.size
         gathered = self._gather(t, first, order, first=True)
         bars: dict[int, Any] = {}
-        for (kind, i), slot in self._slots.items():
+        for (kind, i), slot in self.slot_of.items():
             if kind == "x" and slot in self._bars:
                 bars[i] = t.load(self._bars[slot], first)
             elif kind == "x" and Factor(slot) in gathered:
@@ -353,12 +361,12 @@ class Backward(Series):
             bar = t.load(*self._cell(t, place))
             self._weight_bar(t, constant, bar, one)
             if entry >= 0:
-                add(bars, entry, bar, self._weight(t, start.scalars, weight))
+                add(bars, entry, bar, self.weight(t, start.scalars, weight))
                 self._weight_bar(t, weight, bar, zero[entry])
         for i in reversed(range(len(record.nodes))):
             node = record.nodes[i]
             op, args = node.op, node.args
-            if op in KNOWN and ("x", i) in self._slots:
+            if op in KNOWN and ("x", i) in self.slot_of:
                 power = h
                 for k, w in enumerate(node.weights[1:], 1):
                     self._weight_bar(t, w, power, t.load(self._bar("x", i), t.index(k)))
@@ -373,7 +381,7 @@ class Backward(Series):
             elif op == "sum":
                 self._weight_bar(t, node.weights[-1], bar, one)
                 for a, w in zip(args, node.weights, strict=False):
-                    add(bars, a, bar, self._weight(t, start.scalars, w))
+                    add(bars, a, bar, self.weight(t, start.scalars, w))
                     self._weight_bar(t, w, bar, zero[a])
             elif op == "product":
                 add(bars, args[0], bar, zero[args[1]])

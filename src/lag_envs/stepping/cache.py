@@ -2,7 +2,7 @@
 
 Numba's own cache trusts its files. A file that lost a byte to a full disk, a killed process or an editor
 causes an error deep inside pickle or LLVM, or runs as it is. Here a file begins with a key of what it was
-compiled from and a digest of its content. A file that does not match is dropped and compiled anew. If the
+compiled from and a digest of its content. A file that does not match is dropped and compiled again. If the
 cache cannot be written to, nothing is kept.
 """
 
@@ -37,7 +37,7 @@ class Damaged(Exception):
     """A file whose content is not what was written."""
 
 
-class Entry(NamedTuple):
+class CacheFile(NamedTuple):
     """A file of the cache: its path, its size in bytes, and when it was used last (to a day)."""
 
     path: Path
@@ -65,7 +65,7 @@ def folder() -> Path | None:
         return None
 
 
-def entries(place: Path) -> list[Entry]:
+def cache_files(place: Path) -> list[CacheFile]:
     """Return the files in a cache's folder, most recently used first, with leftovers of killed processes."""
     found = []
     with contextlib.suppress(OSError):
@@ -73,19 +73,19 @@ def entries(place: Path) -> list[Entry]:
             if item.name.endswith(_SUFFIX):
                 with contextlib.suppress(OSError):
                     status = item.stat(follow_symlinks=False)
-                    found.append(Entry(Path(item.path), status.st_size, status.st_mtime))
+                    found.append(CacheFile(Path(item.path), status.st_size, status.st_mtime))
     return sorted(found, key=lambda entry: entry.used, reverse=True)
 
 
 def clear(place: Path) -> int:
     """Remove all files, and return how many there were."""
-    return sum(_remove(entry.path) for entry in entries(place))
+    return sum(_remove(entry.path) for entry in cache_files(place))
 
 
 def trim(place: Path, limit: int) -> None:
     """Remove the least recently used files until the rest has at most `limit` bytes."""
     total = 0
-    for entry in entries(place):
+    for entry in cache_files(place):
         total += entry.size
         if total > limit:
             _remove(entry.path)
@@ -100,7 +100,7 @@ def damage(path: Path) -> str:
 
 
 def writable(place: Path) -> bool:
-    """Tell whether files can be kept in a folder, which need not exist yet."""
+    """Return whether files can be kept in a folder, which need not exist yet."""
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=place):
@@ -138,11 +138,11 @@ def jit(function: Callable, key: str | None = None, inner: bool = False) -> Any:
             known = ((name, function.__globals__.get(name)) for name in function.__code__.co_names)
             key = repr((source, [(name, value) for name, value in known if isinstance(value, int | float)]))
     if key is not None and not numba.config.DISABLE_JIT:
-        dispatcher._cache = _Cache(function.__name__, key)
+        dispatcher._cache = _DispatcherCache(function.__name__, key)
     return dispatcher
 
 
-class _Cache:
+class _DispatcherCache:
     """A cache that a Numba dispatcher asks before it compiles, and tells after; see numba.core.caching."""
 
     def __init__(self, name: str, key: str) -> None:
@@ -162,7 +162,7 @@ class _Cache:
 
     def flush(self) -> None:
         """Forget everything compiled from this function."""
-        for entry in entries(folder() or Path()):
+        for entry in cache_files(folder() or Path()):
             if entry.path.name.startswith(f"{self._name}-"):
                 _remove(entry.path)
 
@@ -324,7 +324,7 @@ def _warn(path: Path, error: Damaged) -> None:
     if not _warned:
         _warned = True
         warnings.warn(
-            f"compiled code in {path} is damaged: {error}; it is dropped and compiled anew. "
+            f"compiled code in {path} is damaged: {error}; it is dropped and compiled again. "
             "`lag-envs cache` looks for more, `lag-envs cache --clear` drops all",
             RuntimeWarning,
             stacklevel=2,

@@ -128,7 +128,7 @@ def compile_traced(
     arguments : str
         Its arguments, separated by commas.
     formula : callable
-        Takes the `Trace` as namespace and one `Number` per argument; returns a tuple of numbers.
+        Takes the `Trace` as namespace and one `TracedNumber` per argument; returns a tuple of numbers.
     absent : frozenset of str
         Arguments that are known to be zero.
     fused : bool

@@ -16,7 +16,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import Layout, compile_attempt, compile_pull, compile_tangent
+from lag_envs.stepping.machine import LaneLayout, compile_attempt, compile_pull, compile_series_tangent
 from lag_envs.stepping.series import TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
@@ -26,7 +26,7 @@ SMALLEST_PART = 1e-9
 
 
 def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
-    """Take one control step of the lane in `rows`, see `Layout`; return the attempts, negative where refused.
+    """Take one control step of the lane in `rows` (`LaneLayout`); return the attempts, negative if refused.
 
     Inputs, places and velocities are read; places and velocities are replaced.
     """
@@ -43,7 +43,7 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
 def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
-    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds; behind them is
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `LaneLayout`, without bounds; behind them is
     room for as many rows and one more. A lane whose status is negative to begin with is left alone.
     Afterwards it is the number of attempts, negative where a lane was refused.
     """
@@ -59,7 +59,7 @@ def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-d
 
 
 def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
-    """Go on with the lanes that are not done, side by side; return how many were refused."""
+    """Continue with the lanes that are not done, side by side; return how many were refused."""
     rows = memory[base + bounds * BLOCK :]  # the last row has the lanes' numbers
     going = refused = 0
     for i in range(count):
@@ -93,7 +93,7 @@ def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
 
 
 def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, Any]:
-    layout = Layout(record)
+    layout = LaneLayout(record)
     return {
         "n": record.size,
         "q": layout.q,
@@ -148,8 +148,8 @@ def compile_advance_block(
 def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of a lane, by which the step is divided, `slopes` those of `compile_tangent`. Where the
-    step is `GUIDED`, they differ in their constants.
+    `rows` are those of a lane, by which the step is divided, `slopes` those of `compile_series_tangent`.
+    Where the step is `GUIDED`, they differ in their constants.
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = dt
@@ -201,8 +201,8 @@ def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-unty
 def compile_advance_tangents(
     record: SeriesRecord, columns: tuple[str, ...], guided: bool = False, tolerance: float = TOLERANCE
 ) -> Callable:
-    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`, `compile_tangent`."""
-    helpers = compile_attempt(record, 1), compile_tangent(record, columns)
+    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`."""
+    helpers = compile_attempt(record, 1), compile_series_tangent(record, columns)
     numbers = _numbers(record, tolerance) | {"GUIDED": guided}
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)

@@ -1,9 +1,10 @@
 """Derivatives of a step: the same algorithm on numbers that carry derivatives along.
 
-A dual number is a value with one derivative per column; None stands for derivatives that are all zero. `Dual`
-makes a target of such numbers from two targets: one of plain numbers, and one whose numbers are vectors with
-an entry per column. So each recurrence is written once, and all columns share its operations. It supports
-what `Series.expand` and `Series.advance` need, but not the certificate: comparisons have no derivative.
+A dual number is a value with one derivative per column; None stands for derivatives that are all zero.
+`DualTarget` makes a target of such numbers from two targets: one of plain numbers, and one whose numbers are
+vectors with an entry per column. So each recurrence is written once, and all columns share its operations. It
+supports what `Series.expand` and `Series.advance` need, but not the certificate: comparisons have no
+derivative.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.stepping.lowering import SeriesRecord
 
 
-class Number(NamedTuple):
+class DualNumber(NamedTuple):
     """A value and its derivatives."""
 
     value: Any
     slopes: Any = None
 
 
-class Dual:
+class DualTarget:
     """Dual numbers on a target of plain ones.
 
     Parameters
@@ -43,26 +44,26 @@ class Dual:
     def __init__(self, target: Any, wide: Any, broadcast: Callable, tangents: Mapping[str, Any]) -> None:
         self._t, self._wide, self._broadcast, self._tangents = target, wide, broadcast, tangents
 
-    def number(self, value: float) -> Number:
-        return Number(self._t.number(value))
+    def number(self, value: float) -> DualNumber:
+        return DualNumber(self._t.number(value))
 
-    def add(self, a: Number, b: Number) -> Number:
+    def add(self, a: DualNumber, b: DualNumber) -> DualNumber:
         both = a.slopes is not None and b.slopes is not None
         slopes = self._wide.add(a.slopes, b.slopes) if both else b.slopes if a.slopes is None else a.slopes
-        return Number(self._t.add(a.value, b.value), slopes)
+        return DualNumber(self._t.add(a.value, b.value), slopes)
 
-    def neg(self, a: Number) -> Number:
-        return Number(self._t.neg(a.value), None if a.slopes is None else self._wide.neg(a.slopes))
+    def neg(self, a: DualNumber) -> DualNumber:
+        return DualNumber(self._t.neg(a.value), None if a.slopes is None else self._wide.neg(a.slopes))
 
-    def abs(self, a: Number) -> Number:
+    def abs(self, a: DualNumber) -> DualNumber:
         t = self._t
         sign = t.select(t.less(a.value, t.number(0.0)), t.number(-1.0), t.number(1.0))
-        return Number(t.abs(a.value), self._times(a.slopes, sign))
+        return DualNumber(t.abs(a.value), self._times(a.slopes, sign))
 
-    def sub(self, a: Number, b: Number) -> Number:
+    def sub(self, a: DualNumber, b: DualNumber) -> DualNumber:
         p, q, w = a.slopes, b.slopes, self._wide
         slopes = p if q is None else w.neg(q) if p is None else w.sub(p, q)
-        return Number(self._t.sub(a.value, b.value), slopes)
+        return DualNumber(self._t.sub(a.value, b.value), slopes)
 
     def _times(self, slopes: Any, factor: Any, total: Any = None) -> Any:
         """Return slopes times a value, plus a total; None stands for zero."""
@@ -71,37 +72,37 @@ class Dual:
         w, every = self._wide, self._broadcast(factor)
         return w.mul(slopes, every) if total is None else w.fma(slopes, every, total)
 
-    def mul(self, a: Number, b: Number) -> Number:
+    def mul(self, a: DualNumber, b: DualNumber) -> DualNumber:
         slopes = self._times(a.slopes, b.value, self._times(b.slopes, a.value))
-        return Number(self._t.mul(a.value, b.value), slopes)
+        return DualNumber(self._t.mul(a.value, b.value), slopes)
 
-    def fma(self, a: Number, b: Number, c: Number) -> Number:
+    def fma(self, a: DualNumber, b: DualNumber, c: DualNumber) -> DualNumber:
         slopes = self._times(a.slopes, b.value, self._times(b.slopes, a.value, c.slopes))
-        return Number(self._t.fma(a.value, b.value, c.value), slopes)
+        return DualNumber(self._t.fma(a.value, b.value, c.value), slopes)
 
-    def div(self, a: Number, b: Number) -> Number:
+    def div(self, a: DualNumber, b: DualNumber) -> DualNumber:
         value = self._t.div(a.value, b.value)
         slopes = self._times(b.slopes, self._t.neg(value), a.slopes)
         if slopes is not None:
             slopes = self._wide.div(slopes, self._broadcast(b.value))
-        return Number(value, slopes)
+        return DualNumber(value, slopes)
 
-    def sqrt(self, a: Number) -> Number:
+    def sqrt(self, a: DualNumber) -> DualNumber:
         t = self._t
         root = t.sqrt(a.value)
-        return Number(root, self._times(a.slopes, t.div(t.number(0.5), root)))
+        return DualNumber(root, self._times(a.slopes, t.div(t.number(0.5), root)))
 
-    def less(self, a: Number, b: Number) -> Any:
+    def less(self, a: DualNumber, b: DualNumber) -> Any:
         return self._t.less(a.value, b.value)
 
     def both(self, a: Any, b: Any) -> Any:
         return self._t.both(a, b)
 
-    def real(self, k: Any) -> Number:
-        return Number(self._t.real(k))
+    def real(self, k: Any) -> DualNumber:
+        return DualNumber(self._t.real(k))
 
-    def reciprocal(self, k: Any) -> Number:
-        return Number(self._t.reciprocal(k))
+    def reciprocal(self, k: Any) -> DualNumber:
+        return DualNumber(self._t.reciprocal(k))
 
     def index(self, k: int) -> Any:
         return self._t.index(k)
@@ -115,30 +116,30 @@ class Dual:
     def minus(self, a: Any, b: Any) -> Any:
         return self._t.minus(a, b)
 
-    def _slopes(self, number: Number) -> Any:
+    def _slopes(self, number: DualNumber) -> Any:
         return self._wide.number(0.0) if number.slopes is None else number.slopes
 
-    def load(self, slot: int, k: Any) -> Number:
-        return Number(self._t.load(slot, k), self._wide.load(slot, k))
+    def load(self, slot: int, k: Any) -> DualNumber:
+        return DualNumber(self._t.load(slot, k), self._wide.load(slot, k))
 
-    def store(self, slot: int, k: Any, value: Number) -> None:
+    def store(self, slot: int, k: Any, value: DualNumber) -> None:
         self._t.store(slot, k, value.value)
         self._wide.store(slot, k, self._slopes(value))
 
     def loop(
-        self, first: Any, end: Any, carried: Sequence[Number], body: Callable, step: int = 1
-    ) -> list[Number]:
-        def flat(numbers: Sequence[Number]) -> list:
+        self, first: Any, end: Any, carried: Sequence[DualNumber], body: Callable, step: int = 1
+    ) -> list[DualNumber]:
+        def flat(numbers: Sequence[DualNumber]) -> list:
             return [part for number in numbers for part in (number.value, self._slopes(number))]
 
-        def paired(parts: Sequence) -> list[Number]:
-            return [Number(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
+        def paired(parts: Sequence) -> list[DualNumber]:
+            return [DualNumber(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
 
         return paired(
             self._t.loop(first, end, flat(carried), lambda k, parts: flat(body(k, paired(parts))), step)
         )
 
-    def elementary(self, name: str, x: Number) -> Number:
+    def elementary(self, name: str, x: DualNumber) -> DualNumber:
         t = self._t
         value = t.elementary(name, x.value)
         one = t.number(1.0)
@@ -150,9 +151,9 @@ class Dual:
             "atan": lambda: t.div(one, t.fma(x.value, x.value, one)),
             "tanh": lambda: t.sub(one, t.mul(value, value)),
         }[name]()
-        return Number(value, self._times(x.slopes, rate))
+        return DualNumber(value, self._times(x.slopes, rate))
 
-    def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Number]:
+    def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, DualNumber]:
         known = self._t.scalars(record, {name: number.value for name, number in inputs.items()})
         found = {}
         for name, value in known.items():
@@ -161,7 +162,7 @@ class Dual:
                 if source in self._tangents and weight != 0.0:
                     factor = known[weight] if isinstance(weight, str) else self._t.number(weight)
                     slopes = self._times(self._tangents[source], factor, slopes)
-            found[name] = Number(value, slopes)
+            found[name] = DualNumber(value, slopes)
         return found
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.adjoint import Differentiable, Lanes
+from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.compiling import compile_function, count_operations, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.tracing import Trace
@@ -150,7 +150,7 @@ def _input(trace: Trace, value: Any) -> Any:
     return trace.zero() if value == 0.0 else value
 
 
-def split(values: Sequence, *sizes: int) -> list[list]:
+def split_lengths(values: Sequence, *sizes: int) -> list[list]:
     """Cut a sequence into lists of the given lengths; the rest forms the last.
 
     Examples
@@ -201,19 +201,19 @@ class Stepper:
             return SimpleNamespace(**dict(zip(constants, values, strict=True)))
 
         def prepare(xp: Any, *values: Any) -> list:
-            y, u, rest = split(values, width, controls)
+            y, u, rest = split_lengths(values, width, controls)
             return [*form.unpack(y, u, k(rest)), *form.drive(y, u, k(rest), xp)]
 
         def finish(xp: Any, *values: Any) -> Sequence:
-            moved, y, u, (dt,), rest = split(values, flow.size, width, controls, 1)
+            moved, y, u, (dt,), rest = split_lengths(values, flow.size, width, controls, 1)
             return form.pack(moved, y, u, dt, k(rest))
 
         def move(xp: Any, *values: Any) -> tuple:
-            variables, coefficients, (dt,) = split(values, flow.size, terms)
+            variables, coefficients, (dt,) = split_lengths(values, flow.size, terms)
             return flow.fast(variables, flow.coefficients(*coefficients), dt, xp)
 
         def within(xp: Any, *values: Any) -> list:
-            variables, coefficients, (dt, x) = split(values, flow.size, terms)
+            variables, coefficients, (dt, x) = split_lengths(values, flow.size, terms)
             return [flow.within(variables, flow.coefficients(*coefficients), dt, x, xp)]
 
         given = list(constants.values())
@@ -283,9 +283,9 @@ class Stepper:
             return [x.value for x in results] + [slope for x in results for slope in x.slopes]
 
         def finish(xp: Any, *numbers: Any) -> list:
-            slopes, rest = split(numbers, 2 * wide)
+            slopes, rest = split_lengths(numbers, 2 * wide)
             names = [*self.start, *self.controls, "dt", *self._names]
-            moved = [Variable(0.0, np.array(part, dtype=object)) for part in split(slopes, wide)]
+            moved = [Variable(0.0, np.array(part, dtype=object)) for part in split_lengths(slopes, wide)]
             others = [Variable(0.0, 0.0)] * (size - 2)
             ends = self._finish(VariableFunctions(xp), *moved, *others, *given(names, rest))
             return [slope for x in ends[:n] for slope in x.slopes]
@@ -348,14 +348,14 @@ class Stepper:
         # The end is linear in the moved variables, so their values are not needed.
         moved = xp.inputs("moved0", "moved1")
         ends = form.pack([*moved, *variables[2:]], lifted, u, k.dt, k)[: self._n_state]
-        *bars, direct = split(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)
+        *bars, direct = split_lengths(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)
         pulled = flow.pull(variables, coefficients, k.dt, [bar for (bar,) in bars], xp)
         found = xp.adjoint([*variables, *coefficients], pulled, by)
         within = flow.within(variables, coefficients, k.dt, k.x, xp)
         return [a + b for a, b in zip(direct, found, strict=True)], within
 
     @cache  # noqa: B019
-    def vjp(self, constants: tuple[str, ...] = ()) -> Lanes:
+    def vjp(self, constants: tuple[str, ...] = ()) -> LaneFormula:
         """Return the reverse mode of ordinary steps, compiled for lanes.
 
         Its inputs are the numbers dt, x and constants; states, controls, and cotangents of the states after
@@ -371,10 +371,10 @@ class Stepper:
             )
             by = [*state, *u, *(numbers[f"k_{name}"] for name in constants)]
             found, within = self.pull(xp, state, u, k, bars, by)
-            return [*split(found, len(state) + len(u)), [xp.where(within, 1.0, 0.0)]]
+            return [*split_lengths(found, len(state) + len(u)), [xp.where(within, 1.0, 0.0)]]
 
         absent = set(self._names) - set(self.constants)
-        return Lanes("vjp", vjp, [y, self.controls, seeds], ["dt", "x", *self._names], absent)
+        return LaneFormula("vjp", vjp, [y, self.controls, seeds], ["dt", "x", *self._names], absent)
 
     @cached_property
     def simulation(self) -> Callable:

@@ -19,7 +19,7 @@ from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import eliminated, exactly
 from lag_envs.mechanics.layout import Prescribed
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import control, parameter
+from lag_envs.mechanics.recording import control, parameter, parameter_values
 from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.elementary import ElementaryTrace
@@ -520,9 +520,9 @@ class StepCode:
     @property
     def scratch(self) -> int:
         """Numbers that `compile` needs in its array of rows."""
-        from lag_envs.stepping.machine import Layout
+        from lag_envs.stepping.machine import LaneLayout
 
-        return Layout(self.record).rows
+        return LaneLayout(self.record).rows
 
     @property
     def arguments(self) -> str:
@@ -630,10 +630,10 @@ def stepper_of(mechanics: Mechanics) -> SeriesStepper:
     return _steppers[mechanics.key]
 
 
-def code_of(scene: Any) -> tuple[StepCode, list[float]]:
+def series_code_of(scene: Any) -> tuple[StepCode, list[float]]:
     """Return the code with which the general series steps a scene, and the constants that it takes."""
     stepper = stepper_of(scene.mechanics)
-    constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
+    constants = stepper.constants(parameter_values(scene))
     code = stepper.code(frozenset(name for name, value in constants.items() if value == 0.0))
     return code, [constants[name.removeprefix("k_")] for name in code.constants]
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from lag_envs.mechanics.algebra import Atom, Expr, derivative
 from lag_envs.stepping.elementary import ElementaryTrace, fading
-from lag_envs.stepping.tracing import Number, Operation, Trace
+from lag_envs.stepping.tracing import Operation, Trace, TracedNumber
 
 #: A weight in a sum: a scalar's name, or a number.
 Weight = str | float
@@ -156,7 +156,7 @@ class Lowering:
         self._free = list(free)
         self._prescribed = dict(prescribed)
         self._trace: Trace = ElementaryTrace()
-        self._inputs: dict[str, Number] = {}
+        self._inputs: dict[str, TracedNumber] = {}
         self.constants: dict[str, Expr] = {}
         self._by_text: dict[str, str] = {}
         self._scalars: dict[str, Any] = {}
@@ -166,7 +166,7 @@ class Lowering:
 
     # --- scalars --------------------------------------------------------------------------------------------
 
-    def _input(self, name: str) -> Number:
+    def _input(self, name: str) -> TracedNumber:
         if name not in self._inputs:
             (self._inputs[name],) = self._trace.inputs(name)
         return self._inputs[name]
@@ -199,14 +199,14 @@ class Lowering:
                         value = value * number if n > 0 else value / number
                 total = total + value
             self._scalars[expr.text] = total
-            if isinstance(total, Number):
+            if isinstance(total, TracedNumber):
                 self._exprs[total.name] = expr
         return self._scalars[expr.text]
 
     def _differentiate(self, weights: Sequence[Any]) -> None:
         """Record the derivatives of weights with respect to their chosen sources."""
         for weight in weights:
-            if self._wanted is None or not isinstance(weight, Number) or weight.name in self._slopes:
+            if self._wanted is None or not isinstance(weight, TracedNumber) or weight.name in self._slopes:
                 continue
             expr = self._exprs[weight.name]
             self._slopes[weight.name] = {
@@ -289,7 +289,7 @@ class Lowering:
         return self._known[key] + (atom.function == "cos")
 
     def _rate(self, argument: Expr) -> tuple[int, ...]:
-        """Return the node of an argument's rate if it is a weighted sum of places, else nothing."""
+        """Return the node of an argument's rate if it is a weighted sum of places, else None."""
         total = Expr({})
         for monomial, c in argument.terms.items():
             varying = [(atom, n) for atom, n in monomial if self._varies(atom)]
@@ -416,12 +416,12 @@ class Lowering:
         weights = _weights(self.nodes, entries)
         slopes = [
             (w.name, source, slope)
-            for w in {w.name: w for w in weights if isinstance(w, Number)}.values()
+            for w in {w.name: w for w in weights if isinstance(w, TracedNumber)}.values()
             for source, slope in self._slopes.get(w.name, {}).items()
         ]
         operations, results = self._trace.operations([*weights, *(s for *_, s in slopes)], zero, fused=fused)
         value = iter(results)
-        called = {w.name: r for w, r in zip(weights, results, strict=False) if isinstance(w, Number)}
+        called = {w.name: r for w, r in zip(weights, results, strict=False) if isinstance(w, TracedNumber)}
         tangents: dict[str, dict[str, Weight]] = {}
         for (name, source, _), slope in zip(slopes, results[len(weights) :], strict=True):
             if isinstance(called[name], str) and slope != 0.0:
@@ -527,7 +527,7 @@ def _weights(nodes: Sequence[tuple], entries: Mapping) -> list:
 
 
 def _key(weight: Any) -> Any:
-    return weight.name if isinstance(weight, Number) else float(weight)
+    return weight.name if isinstance(weight, TracedNumber) else float(weight)
 
 
 def _is_constant(atom: Atom) -> bool:

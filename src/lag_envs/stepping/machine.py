@@ -14,18 +14,29 @@ from numba import types
 from numba.extending import intrinsic
 
 from lag_envs.mechanics import algebra
-from lag_envs.stepping import backward, dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping import (
+    backward,
+    certificate,
+    dual,
+    elementary,
+    lowering,
+    matrices,
+    primitives,
+    series,
+    target,
+    tracing,
+)
 from lag_envs.stepping.backward import Backward
 from lag_envs.stepping.compiling import BLOCK, compile_function
-from lag_envs.stepping.dual import Dual
+from lag_envs.stepping.dual import DualTarget
 from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.series import STRIDE, Lane, Series
+from lag_envs.stepping.series import STRIDE, Series, StepProgress
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
 
-class Layout:
+class LaneLayout:
     """Where the numbers of a lane lie: rows, one behind the other or `BLOCK` numbers apart.
 
     Attributes
@@ -113,7 +124,7 @@ class Machine:
         return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
 
     def most(self, condition: Any, of: Any) -> ir.Value:
-        """Tell whether a condition holds in at least two thirds of the lanes in which another holds."""
+        """Return whether a condition holds in at least two thirds of the lanes in which another holds."""
         kind = ir.IntType(self._lanes)
         count, total = (self._b.zext(self._b.ctpop(self._b.bitcast(x, kind)), _INT) for x in (condition, of))
         three, two = ir.Constant(_INT, 3), ir.Constant(_INT, 2)
@@ -192,7 +203,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
+        """Return the request not to unroll a loop: these are short, and long code compiles slowly."""
         module = self._b.module
         unrolled = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         off = ir.Constant(_BIT, 0)
@@ -227,7 +238,7 @@ class Machine:
         return phis
 
     def elementary(self, name: str, x: Any) -> ir.Value:
-        operations, result = series.elementary(name, self._fused)
+        operations, result = target.elementary(name, self._fused)
         return emit(self._b, operations, {"x": x})[result]
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
@@ -237,7 +248,10 @@ class Machine:
 @cache
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
-    modules = (algebra, backward, dual, elementary, lowering, primitives, series, tracing)
+    modules = (
+        *(algebra, backward, certificate, dual, elementary, lowering, matrices, primitives, series),
+        *(target, tracing),
+    )
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]
     )
@@ -291,7 +305,7 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
     """Return ``attempt(rows, at, dt, order, tolerance)``, to be called from compiled code.
 
     It takes a step of each lane for which something is left, of the length that is wished for or of a part of
-    it, and replaces places, velocities, status, `left` and `wish` in the rows of `Layout`, which begin at
+    it, and replaces places, velocities, status, `left` and `wish` in the rows of `LaneLayout`, which begin at
     ``rows[at]``. It returns 1 where nothing is left, else 0. See `Series.substep`.
 
     Parameters
@@ -315,7 +329,7 @@ def _write(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, lanes: int, fused: bool
 ) -> ir.Function:
     """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
-    step, layout, n = Series(record), Layout(record), record.size
+    step, layout, n = Series(record), LaneLayout(record), record.size
     function = ir.Function(module, kind, name)
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
@@ -340,7 +354,7 @@ def _write(
 
     inputs = {name: read(row) for name, row in layout.inputs.items()}
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
-    before = Lane(q, v, read(layout.status), read(layout.left), read(layout.wish))
+    before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
     lane, bounds = step.substep(t, inputs, before, splat(dt), order, splat(tolerance))
     for i in range(n):
         write(layout.q + i, lane.q[i])
@@ -361,10 +375,10 @@ def slots_for(columns: int) -> int:
     return 1 << max(columns - 1, 0).bit_length()
 
 
-def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
+def compile_series_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
-    The rows are inputs, places and velocities as in `Layout`, the time since the control step began, the
+    The rows are inputs, places and velocities as in `LaneLayout`, the time since the control step began, the
     step, and then the derivatives of the places and velocities by `columns`, as a matrix with `slots_for`
     columns. Places, velocities and the matrix are replaced by those after the step.
 
@@ -386,7 +400,7 @@ def _write_tangent(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, columns: tuple[str, ...]
 ) -> ir.Function:
     """Write the function ``name(rows, order)`` into a module."""
-    step, layout, n = Series(record), Layout(record), record.size
+    step, layout, n = Series(record), LaneLayout(record), record.size
     width, matrix = slots_for(len(columns)), layout.status + 2
     function = ir.Function(module, kind, name)
     set.add(function.attributes, '"prefer-vector-width"="512"')
@@ -399,7 +413,7 @@ def _write_tangent(
         return numbers[0] if width == 1 else ir.Constant(wide.kind, numbers)
 
     tangents = {source: unit(i) for i, source in enumerate(columns)}
-    t: Any = Dual(plain, wide, wide.broadcast, tangents)
+    t: Any = DualTarget(plain, wide, wide.broadcast, tangents)
 
     def at(row: int) -> ir.Value:
         return builder.gep(rows, [ir.Constant(_INT, row)])
@@ -407,16 +421,16 @@ def _write_tangent(
     def slopes(i: int) -> ir.Value:
         return builder.bitcast(at(matrix + i * width), wide.kind.as_pointer())
 
-    def moving(row: int, i: int) -> dual.Number:
+    def moving(row: int, i: int) -> dual.DualNumber:
         derivatives = builder.load(slopes(i))
         derivatives.align = 8
-        return dual.Number(builder.load(at(row)), derivatives)
+        return dual.DualNumber(builder.load(at(row)), derivatives)
 
-    inputs = {name: dual.Number(builder.load(at(row))) for name, row in layout.inputs.items()}
-    inputs[ELAPSED] = dual.Number(builder.load(at(layout.status)))
+    inputs = {name: dual.DualNumber(builder.load(at(row))) for name, row in layout.inputs.items()}
+    inputs[ELAPSED] = dual.DualNumber(builder.load(at(layout.status)))
     q = [moving(layout.q + i, i) for i in range(n)]
     v = [moving(layout.v + i, n + i) for i in range(n)]
-    h = dual.Number(builder.load(at(layout.status + 1)))
+    h = dual.DualNumber(builder.load(at(layout.status + 1)))
     step.expand(t, inputs, q, v, h, order)
     q, v = step.advance(t, q, h, order)
     for i, number in enumerate([*q, *v]):
@@ -429,9 +443,9 @@ def _write_tangent(
 def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> Callable:
     """Return ``pull(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
 
-    Rows are `BLOCK` numbers apart: those of `Layout` up to `wish`, then cotangents of places and velocities
-    after the substep, and of the sources. All but the inputs are replaced. It returns 1 if the lanes that
-    ended their step went backwards, see `Backward.pull`.
+    Rows are `BLOCK` numbers apart: those of `LaneLayout` up to `wish`, then cotangents of places and
+    velocities after the substep, and of the sources. All but the inputs are replaced. It returns 1 if the
+    lanes that ended their step went backwards, see `Backward.pull`.
 
     Parameters
     ----------
@@ -453,7 +467,7 @@ def _write_pull(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, sources: tuple, lanes: int
 ) -> ir.Function:
     """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
-    step, layout, n = Backward(record, sources), Layout(record), record.size
+    step, layout, n = Backward(record, sources), LaneLayout(record), record.size
     function = ir.Function(module, kind, name)
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
@@ -471,7 +485,7 @@ def _write_pull(
 
     inputs = {name: read(row) for name, row in layout.inputs.items()}
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
-    before = Lane(q, v, read(layout.status), read(layout.left), read(layout.wish))
+    before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
     bars = [read(layout.bounds + i) for i in range(2 * n + len(sources))]
     lane, bars, back = step.pull(t, inputs, before, t.broadcast(dt), order, t.broadcast(tolerance), bars)
     for row, value in enumerate([*lane.q, *lane.v, *lane[2:], *bars], layout.q):

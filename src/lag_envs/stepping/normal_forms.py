@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from lag_envs.mechanics.algebra import Atom, Expr, Monomial, derivative, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import Exact, exactly
-from lag_envs.mechanics.layout import Layout
+from lag_envs.mechanics.layout import SceneLayout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
@@ -34,7 +34,7 @@ from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
 
 
-class Term(NamedTuple):
+class CoefficientTerm(NamedTuple):
     """A term of a coefficient: a constant, by name, times a quantity that is held during the step."""
 
     constant: str
@@ -62,8 +62,8 @@ class NormalForm:
     """
 
     kind: ClassVar[type[Any]]
-    layout: Layout
-    terms: Mapping[str, tuple[Term, ...]]
+    layout: SceneLayout
+    terms: Mapping[str, tuple[CoefficientTerm, ...]]
     expressions: Mapping[str, Expr]
     inertia: Expr
 
@@ -472,12 +472,12 @@ def _form(
     names = {expr.text: name for name, expr in expressions.items()}
     terms = {}
     for coefficient, part in parts.items():
-        found: list[Term] = []
+        found: list[CoefficientTerm] = []
         for held, constant in part.values():
             if constant.text not in names:
                 name = coefficient if held.number == 1.0 else f"{coefficient}_{len(found)}"
                 names[constant.text] = name
                 expressions[name] = constant
-            found.append(Term(names[constant.text], held))
+            found.append(CoefficientTerm(names[constant.text], held))
         terms[coefficient] = tuple(found)
     return form(m.layout, terms, expressions, m.entry(0, 0))

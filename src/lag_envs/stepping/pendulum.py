@@ -248,7 +248,7 @@ def step_slopes(
 
 
 def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
-    """Tell whether the three conditions of the bound hold for this x; written without a root."""
+    """Return whether the three conditions of the bound hold for this x; written without a root."""
     a, b, gamma, d, r = scaled(coeffs, h)
     half, loss = 0.5 * (x * x), xp.abs(gamma) * x
     room = half - loss - xp.abs(d)

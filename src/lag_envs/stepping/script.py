@@ -18,8 +18,9 @@ import numpy as np
 from lag_envs.stepping.driver import LARGEST_COUNT, SMALLEST_PART
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Lane, Series, elementary
-from lag_envs.stepping.tracing import IEEE, MAGIC, Number, Operation, Value
+from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series, StepProgress
+from lag_envs.stepping.target import elementary
+from lag_envs.stepping.tracing import IEEE, MAGIC, Operation, TracedNumber, Value
 
 #: Every operation of a recording, in Python, JavaScript and C++. Where Python raises an error, C does not.
 OPERATIONS: Mapping[str, tuple[str, str, str]] = {
@@ -173,11 +174,11 @@ INLINE real rough_log2(real x) { return log2(x); }
 )
 
 
-class Formulas(ElementaryTrace):
+class ScriptTrace(ElementaryTrace):
     """A recording in which function calls stay calls; a script contains each function once."""
 
     def _function(self, name: str, a: Any) -> Any:
-        if isinstance(a, Number):
+        if isinstance(a, TracedNumber):
             return self.record(name, a)
         return getattr(ElementaryTrace, name)(self, a)
 
@@ -212,7 +213,7 @@ class Formulas(ElementaryTrace):
         return self._function("tanh", a)
 
 
-class Term(NamedTuple):
+class ScriptTerm(NamedTuple):
     """An operation of `OPERATIONS` on names and numbers, or a call of an elementary function."""
 
     op: str
@@ -228,7 +229,7 @@ class Statement(NamedTuple):
 
 
 class Script:
-    """The target that writes source text: numbers are names or literals; see `series.Target`.
+    """The target that writes source text: numbers are names or literals; see `target.Target`.
 
     Examples
     --------
@@ -281,7 +282,7 @@ class Script:
     def put(self, op: str, *args: Any) -> str:
         """Write an operation; return the name of its result."""
         name = self._new()
-        self.say("let", name, Term(op, args))
+        self.say("let", name, ScriptTerm(op, args))
         return name
 
     def _inside(self, write: Callable[[], Any]) -> tuple[Statement, ...]:
@@ -317,7 +318,7 @@ class Script:
 
         Inputs map the formula's names to names of this script; an input 0.0 is known to be zero.
         """
-        trace = Formulas()
+        trace = ScriptTrace()
         given = [
             trace.inputs(name)[0] if isinstance(value, str) else trace.zero() if value == 0.0 else value
             for name, value in inputs.items()
@@ -326,7 +327,7 @@ class Script:
         known = self.emit(operations, inputs)
         return [known[r] if isinstance(r, str) else r for r in results]
 
-    # --- the operations of `series.Target` ------------------------------------------------------------------
+    # --- the operations of `target.Target` ------------------------------------------------------------------
 
     def number(self, value: float) -> Any:
         return float(value)
@@ -467,7 +468,7 @@ def _lines(block: Iterable[Statement], language: Language, depth: int = 0) -> It
     column = language.column
 
     def text(value: Any) -> str:
-        if isinstance(value, Term):
+        if isinstance(value, ScriptTerm):
             form = OPERATIONS[value.op][column] if value.op in OPERATIONS else f"{value.op}({{}})"
             return form.format(*map(text, value.args))
         if isinstance(value, str):
@@ -498,7 +499,7 @@ def _named(value: Any) -> Iterator[str]:
     """Return the variables in a part of a statement."""
     if isinstance(value, str):
         yield from _NAME.findall(value)
-    elif isinstance(value, Term):
+    elif isinstance(value, ScriptTerm):
         for arg in value.args:
             yield from _named(arg)
 
@@ -542,7 +543,9 @@ def _without_unused(function: Statement) -> Statement:
 def _with_memory(function: Statement, arrays: Iterable[Statement]) -> Statement:
     """Return a function that declares the arrays that it uses."""
     every = list(_all(function.body))
-    used = {part.args[0] for s in every for part in s.parts if isinstance(part, Term) and part.op == "read"}
+    used = {
+        part.args[0] for s in every for part in s.parts if isinstance(part, ScriptTerm) and part.op == "read"
+    }
     used |= {s.parts[0] for s in every if s.kind == "write"}
     return function._replace(body=(*(array for array in arrays if array.parts[0] in used), *function.body))
 
@@ -602,8 +605,8 @@ def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Sta
     """Return a block with its shared variables kept in an array."""
 
     def put(value: Any, known: Mapping[str, str]) -> Any:
-        if isinstance(value, Term):
-            return Term(value.op, tuple(put(arg, known) for arg in value.args))
+        if isinstance(value, ScriptTerm):
+            return ScriptTerm(value.op, tuple(put(arg, known) for arg in value.args))
         return _NAME.sub(lambda m: known.get(m[0], m[0]), value) if isinstance(value, str) else value
 
     def changed(block: Sequence[Statement], known: Mapping[str, str]) -> Iterator[Statement]:
@@ -625,7 +628,7 @@ def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Sta
 # --- the series' step, and running what was printed ---------------------------------------------------------
 
 
-def motion(
+def script_motion(
     t: Script,
     record: SeriesRecord,
     inputs: dict[str, Any],
@@ -658,7 +661,7 @@ def motion(
     smallest = t.mul(SMALLEST_PART, dt)
 
     def attempt(count: Any, carried: Sequence) -> tuple[Any, list]:
-        lane = Lane(carried[:n], carried[n : 2 * n], 0.0, *carried[2 * n :])
+        lane = StepProgress(carried[:n], carried[n : 2 * n], 0.0, *carried[2 * n :])
         after, _ = step.substep(t, inputs, lane, dt, order, tolerance)
         going = t.both(t.less(0.0, after.left), t.less(smallest, after.wish))
         return going, [*after.q, *after.v, after.left, after.wish]

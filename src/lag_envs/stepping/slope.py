@@ -61,7 +61,7 @@ def slide(x: Any, v: Any, force: FixedSlope, dt: Any) -> tuple:
 
 
 def slides(force: FixedSlope, dt: Any) -> Any:
-    """Tell whether `slide` is exact to rounding."""
+    """Return whether `slide` is exact to rounding."""
     decay = force.damping_rate * dt
     return (decay <= SMALL_DECAY) & (decay >= -SMALL_DECAY)
 
@@ -256,7 +256,7 @@ def turn_substep(x: Twofold, w: Twofold, c: Twofold, s: Twofold, turn: TurningSl
 
 
 def turns(turn: TurningSlope, h: Any, xp: Any) -> Any:
-    """Tell whether one step of the series is exact to rounding."""
+    """Return whether one step of the series is exact to rounding."""
     return h * (2.0 * turn.damping_rate + rate_factor(turn.centrifugal, xp) * xp.abs(turn.rate)) <= SMALL_TURN
 
 

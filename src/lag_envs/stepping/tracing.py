@@ -1,8 +1,8 @@
 """Run a formula once on recording numbers and turn it into straight-line code.
 
 Scenes, tasks and the Taylor recurrences are written as short loops on "numbers": floats, NumPy arrays, torch
-tensors or SymPy symbols. For speed the same functions are run once on `Number` objects, which record every
-operation; the record then becomes one straight-line compiled function. Three things happen on the way:
+tensors or SymPy symbols. For speed the same functions are run once on `TracedNumber` objects, which record
+every operation; the record then becomes one straight-line compiled function. Three things happen on the way:
 
 * Equal operations are recorded once, and operations on constants are evaluated at once.
 * ``a * b + c`` becomes one fused multiply-add if the product is used nowhere else. The fusion is thus
@@ -104,7 +104,7 @@ class Operation(NamedTuple):
     args: tuple[Value, ...]
 
 
-class Number:
+class TracedNumber:
     """A value that records the arithmetic done on it."""
 
     __slots__ = ("args", "name", "op", "trace")
@@ -207,37 +207,37 @@ class Trace:
     """
 
     def __init__(self) -> None:
-        self._nodes: list[Number] = []
-        self._known: dict[tuple, Number] = {}
+        self._nodes: list[TracedNumber] = []
+        self._known: dict[tuple, TracedNumber] = {}
         self._zeros: set[str] = set()
 
-    def inputs(self, *names: str) -> list[Number]:
-        """Return one `Number` per name."""
-        return [Number(self, name) for name in names]
+    def inputs(self, *names: str) -> list[TracedNumber]:
+        """Return one `TracedNumber` per name."""
+        return [TracedNumber(self, name) for name in names]
 
     def record(self, op: str, *args: Any) -> Any:
         """Record an operation, or evaluate it if it needs no recording."""
-        args = tuple(a if isinstance(a, Number | bool) else float(a) for a in args)
-        if not any(isinstance(a, Number) for a in args):
+        args = tuple(a if isinstance(a, TracedNumber | bool) else float(a) for a in args)
+        if not any(isinstance(a, TracedNumber) for a in args):
             return _FLOAT[op](*args)
         simple = _simplify(op, args)
         if simple is not None:
             return simple
-        key = (op, *(a.name if isinstance(a, Number) else (type(a), str(a)) for a in args))
+        key = (op, *(a.name if isinstance(a, TracedNumber) else (type(a), str(a)) for a in args))
         if key not in self._known:
-            node = Number(self, f"t{len(self._nodes)}", op, args)
+            node = TracedNumber(self, f"t{len(self._nodes)}", op, args)
             self._nodes.append(node)
             self._known[key] = node
         return self._known[key]
 
-    def zero(self) -> Number:
+    def zero(self) -> TracedNumber:
         """Return a number known to be zero.
 
         Its terms are dropped, like those of a literal 0.0, but only after products have been fused. So the
         other terms round as they would if it were not zero, and environments with and without, say, damping
         get the same bits in one batch.
         """
-        number = Number(self, f"zero{len(self._zeros)}")
+        number = TracedNumber(self, f"zero{len(self._zeros)}")
         self._zeros.add(number.name)
         return number
 
@@ -248,7 +248,7 @@ class Trace:
 
         The operations are in order, without those that no output needs. Inputs named in `zeros` are known to
         be zero, like the numbers that `zero` returns. With ``fused=False`` no product is fused with a sum:
-        then all operations round alike on every machine and in every language (see `evaluate`).
+        then all operations round alike on every machine and in every language (see `evaluate_operations`).
         """
         outputs = list(outputs)
         results = [_name(value) for value in outputs]
@@ -266,7 +266,7 @@ class Trace:
         stack = list(outputs)
         while stack:
             value = stack.pop()
-            if isinstance(value, Number):
+            if isinstance(value, TracedNumber):
                 uses[value.name] = uses.get(value.name, 0) + 1
                 if uses[value.name] == 1:
                     stack.extend(value.args)
@@ -276,7 +276,7 @@ class Trace:
             if fuse and node.name in uses and node.op in FUSED:
                 first, second = node.args
                 for op, product, other in zip(FUSED[node.op], (first, second), (second, first), strict=True):
-                    if isinstance(product, Number) and product.op == "*" and uses[product.name] == 1:
+                    if isinstance(product, TracedNumber) and product.op == "*" and uses[product.name] == 1:
                         fused[node.name] = Operation(node.name, op, (*map(_name, product.args), _name(other)))
                         swallowed.add(product.name)
                         break
@@ -345,7 +345,7 @@ class Trace:
         return self.record("copysign", a, sign)
 
 
-def evaluate(
+def evaluate_operations(
     operations: Iterable[Operation],
     values: Mapping[str, Any],
     functions: Mapping[str, Callable] | None = None,
@@ -502,4 +502,4 @@ def _drop_zeros(operations: list[Operation], results: list[Value], zeros: set[st
 
 def _name(value: Any) -> Value:
     """Return a number's name, or the constant."""
-    return value.name if isinstance(value, Number) else value
+    return value.name if isinstance(value, TracedNumber) else value

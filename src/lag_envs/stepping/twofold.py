@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.stepping.tracing import Number, polynomial
+from lag_envs.stepping.tracing import TracedNumber, polynomial
 
 
 class Twofold:
@@ -79,7 +79,7 @@ def two_product(a: Any, b: Any) -> tuple[Any, Any]:
     """Return a * b as a float, and its rounding error."""
     product = a * b
     for factor in (a, b):
-        if isinstance(factor, Number):
+        if isinstance(factor, TracedNumber):
             return product, factor.trace.record("a*b-c", a, b, product)
     return product, float(Fraction(a) * Fraction(b) - Fraction(product))
 
@@ -100,7 +100,7 @@ def twofold_parts(*numbers: Twofold) -> tuple:
 def _twofold(value: Any) -> Twofold:
     if isinstance(value, Twofold):
         return value
-    if isinstance(value, Number):
+    if isinstance(value, TracedNumber):
         return Twofold(value)
     fraction = Fraction(value).limit_denominator(1000)
     return Twofold(value, float(fraction - Fraction(value)) if float(fraction) == value else 0.0)

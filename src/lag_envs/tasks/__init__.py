@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lag_envs.tasks.measured import known
+from lag_envs.tasks.measured import measured_ids
 
 
 class Tasks(UserDict[str, Any]):
@@ -50,7 +50,7 @@ def resolve(place: str) -> Any:
     return found
 
 
-def find(folder: Path, package: str) -> dict[str, str]:
+def find_tasks(folder: Path, package: str) -> dict[str, str]:
     """Return the places of the tasks in a package's folder: classes with a line ``id = "..."``.
 
     The files are read, not imported: importing them would make ``import lag_envs`` half as slow again.
@@ -64,9 +64,9 @@ def find(folder: Path, package: str) -> dict[str, str]:
             if env_id:
                 places[env_id] = f"{package}{file.stem}:{kind}"
     # In the order in which they were measured.
-    order = {env_id: i for i, env_id in enumerate(known())}
+    order = {env_id: i for i, env_id in enumerate(measured_ids())}
     return dict(sorted(places.items(), key=lambda item: order.get(item[0], len(order))))
 
 
 #: The package's tasks.
-TASKS = Tasks(find(Path(__file__).parent, f"{__name__}."))
+TASKS = Tasks(find_tasks(Path(__file__).parent, f"{__name__}."))

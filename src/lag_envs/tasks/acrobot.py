@@ -145,7 +145,7 @@ class AcrobotExact(Task):
         return 0.0
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the tip is a link's length above the pivot."""
+        """Return whether the tip is a link's length above the pivot."""
         return -xp.cos(after.theta_1) - xp.cos(after.theta_1 + after.theta_2) > 1.0
 
     def bodies(self) -> Bodies:
@@ -335,7 +335,7 @@ class AcrobotReal(Task):
         return 0.02 * height**4 * (1.0 - 0.1 * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the tip is up."""
+        """Return whether the tip is up."""
         return self.tip(after, xp) > self.high
 
     def bodies(self) -> Bodies:

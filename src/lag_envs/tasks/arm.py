@@ -144,7 +144,7 @@ class Reach(Task):
         return xp.exp(-10.0 * xp.sqrt(self.off(after, target, xp))) * (1.0 - 0.05 * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the hand is within 2 cm of the point."""
+        """Return whether the hand is within 2 cm of the point."""
         return self.off(after, target, xp) <= 0.02**2
 
     def bodies(self) -> Bodies:

@@ -47,19 +47,19 @@ class _OnTrack(Task):
         return Window(-wide, -tall, wide, tall)
 
     def off_track(self, after: Any, xp: Any) -> Any:
-        """Tell whether the cart has left its track."""
+        """Return whether the cart has left its track."""
         return xp.abs(after.x) > self.track
 
     def check_start(self, state: Any) -> None:
         """Refuse a start from which the episode would be over."""
-        if self.terminated(state, None, _Numbers):
+        if self.terminated(state, None, _NumberFunctions):
             raise ValueError(
                 f"the start must lie inside the limits at which an episode ends, got x={state.x:g} m, "
                 f"theta={state.theta:g} rad"
             )
 
 
-class _Numbers:
+class _NumberFunctions:
     """What `terminated` needs of a namespace, for numbers."""
 
     abs = staticmethod(abs)
@@ -178,7 +178,7 @@ class CartPoleExact(_OnTrack):
         return 1.0
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cart has left its track, or the pole leans by more than 12 degrees."""
+        """Return whether the cart has left its track, or the pole leans by more than 12 degrees."""
         return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
 
 
@@ -299,7 +299,7 @@ class CartPoleContinuous(_OnTrack):
         return 0.0
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cart has left its track, or the pole leans by more than 12 degrees."""
+        """Return whether the cart has left its track, or the pole leans by more than 12 degrees."""
         return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
@@ -451,9 +451,9 @@ class CartPoleSwingUp(_OnTrack):
         return height * height * (1.0 - 0.1 * effort * effort)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cart has left its track."""
+        """Return whether the cart has left its track."""
         return self.off_track(after, xp)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the pole is within 0.2 rad of upright."""
+        """Return whether the pole is within 0.2 rad of upright."""
         return xp.cos(after.theta) >= math.cos(0.2)

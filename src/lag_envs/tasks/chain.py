@@ -15,7 +15,7 @@ from lag_envs.tasks.record import Controller, Examples, Goal, Open, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 
-class _Chain(Support):
+class _ChainTask(Support):
     """What the tasks with chains share."""
 
     scene: Any
@@ -47,7 +47,7 @@ class _Chain(Support):
         kicked = self.largest_kick * math.sqrt(0.5 * about_joint) * self.limit
         return (math.sqrt(turning + fall) + pushed + kicked) * math.sqrt(2.0 / scene.inertia)
 
-    def push(self, draws: Any, xp: Any) -> dict[str, Any]:
+    def occasional_kick(self, draws: Any, xp: Any) -> dict[str, Any]:
         """Return an occasional kick of the last bar's rate to either side."""
         size = self.largest_kick * (2.0 * draws[1] - 1.0)
         return {f"{self.angles[-1]}_dot": xp.where(draws[0] < self.chance(self.kick_chance), size, 0.0)}
@@ -63,7 +63,7 @@ class _Chain(Support):
         return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
 
 
-class SwingUp(GuardedTrack, _Chain):
+class SwingUp(GuardedTrack, _ChainTask):
     """Swing a double pendulum up by moving its support, and hold it upright.
 
     ## Description
@@ -223,7 +223,7 @@ good, because all starts are close together.
         return self.height(after, xp) ** 4 - 0.02 * (effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether each bar is within 0.2 rad of upright."""
+        """Return whether each bar is within 0.2 rad of upright."""
         lowest = xp.cos(after[self.angles[0]])
         for name in self.angles[1:]:
             lowest = xp.maximum(lowest, xp.cos(after[name]))
@@ -448,10 +448,10 @@ alone works only if the bars happen to pass upright slowly.
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Change the last bar's rate, now and then."""
-        return self.push(draws, xp)
+        return self.occasional_kick(draws, xp)
 
 
-class Balance(_Chain):
+class Balance(_ChainTask):
     """Keep a double pendulum upright against kicks by moving its support.
 
     ## Description
@@ -612,7 +612,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
         return 1.0 - squares * (0.5 / self.scene.bars) - 0.5 * (s * s)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether a bar has fallen or the support has left the track."""
+        """Return whether a bar has fallen or the support has left the track."""
         over = xp.abs(after.s) > self.scene.track
         for e in self.leaning(after).values():
             over = over | (xp.abs(e) > self.largest_angle)
@@ -624,7 +624,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Change the last bar's rate, now and then."""
-        return self.push(draws, xp)
+        return self.occasional_kick(draws, xp)
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return s, s', the angles from upright, and their rates."""

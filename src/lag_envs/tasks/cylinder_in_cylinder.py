@@ -61,7 +61,7 @@ class _Shell(Task):
         return float(2.0 * math.sqrt(push.alpha) + (2.0 * push.delta + 1.0) * self.fastest_shell)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cylinder has been carried too high."""
+        """Return whether the cylinder has been carried too high."""
         return xp.abs(after.theta) > self.largest_angle
 
     def bounds(self) -> Mapping[str, float]:
@@ -225,7 +225,7 @@ of their loss comes afterwards: they stop beside the target, while the controlle
         return xp.exp(-(off * off)) - 0.02 * (effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the angle is within 0.05 rad of the target."""
+        """Return whether the angle is within 0.05 rad of the target."""
         return xp.abs(after.theta - target.target) <= 0.05
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
@@ -387,7 +387,7 @@ energy with less effort than TD3.
         return xp.exp(-off) - 0.02 * (effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the energy is within 20 % of the wanted one."""
+        """Return whether the energy is within 20 % of the wanted one."""
         energy, wanted = self.energies(after, xp)
         return xp.abs(energy - wanted) <= 0.2 * wanted
 
@@ -546,7 +546,7 @@ corner of the line.
         return xp.exp(-10.0 * xp.sqrt(theta * theta + (rate * rate) * (1.0 / self.omega0_squared(xp))))
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cylinder is near rest."""
+        """Return whether the cylinder is near rest."""
         return after.theta * after.theta + after.theta_dot * after.theta_dot / self.omega0_squared() <= 0.1**2
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
@@ -558,7 +558,7 @@ corner of the line.
         return {f"time within {size:g} of rest [%]": share for size, share in shares.items()}
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the contact is lost: aθ'² + g cosθ < 0."""
+        """Return whether the contact is lost: aθ'² + g cosθ < 0."""
         hold = self.scene.gravity / self.scene.arm
         return after.theta_dot * after.theta_dot + hold * xp.cos(after.theta) < 0.0
 

@@ -15,8 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes.checks import check_lags, check_number, shown
 from lag_envs.scenes.declaring import complete
+from lag_envs.scenes.derivation import layout_of
+from lag_envs.tasks.formulas import UNBOUNDED
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -43,7 +46,6 @@ MOST_DRAWN = 8
 _WHOLE = 1e-9
 #: Bounds that are not proved are wider by this share; values beyond them are clipped.
 MARGIN = 0.1
-_UNBOUNDED = float(np.finfo(np.float32).max)
 
 
 def normals(first: Any, second: Any, xp: Any) -> list[Any]:
@@ -289,7 +291,7 @@ def _lag(task: Task, value: Any) -> dict[str, Any]:
 def _push(task: Task, value: Any) -> dict[str, Any]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise ValueError(f"push must be (pushes per second, largest size), got {shown(value)}")
-    layout = task.scene._layout
+    layout = layout_of(task.scene)
     moving = [e.name for e in layout.state if e.coordinate in layout.free and e.kind != "place"]
     rate = check_number("push: its rate", value[0], "1/s")
     if rate < 0.0:
@@ -313,7 +315,7 @@ def _randomize(task: Task, value: Any) -> dict[str, Any]:
 
 def _draw(task: Task, name: str, given: Any) -> Draw:
     where, scene = f"randomize[{name!r}]", task.scene
-    if name not in (numbers := scene._numbers()):
+    if name not in (numbers := parameter_names(scene)):
         known = [*inspect.signature(type(scene)).parameters, "dt", "duration", "target"]
         why = "it decides how the environment is built" if name in known else "there is no such parameter"
         raise ValueError(f"{where}: it cannot be drawn, {why}; what can be is {', '.join(numbers)}")
@@ -430,7 +432,7 @@ class Drawn:
         given = {d.name for d in self.draws} | {
             name for name, value in self.task.given.items() if value is not None
         }
-        return {name: fields[name] for name in scene._numbers() if fields[name] and name not in given}
+        return {name: fields[name] for name in parameter_names(scene) if fields[name] and name not in given}
 
 
 def _listed(values: Mapping[str, float]) -> str:
@@ -459,9 +461,9 @@ def seen_box(task: Task) -> tuple[list[float], list[float]]:
         ends = [box[0][i] for box in boxes], [box[1][i] for box in boxes]
         for values, end, side, out in ((ends[0], min, -1.0, low), (ends[1], max, 1.0, high)):
             bound = end(values)
-            if abs(bound) < _UNBOUNDED:
+            if abs(bound) < UNBOUNDED:
                 if found.within or found.lag or min(values) != max(values):
                     bound += side * MARGIN * abs(bound)
                 bound += side * sigma * LARGEST_NORMAL
-            out.append(min(max(bound, -_UNBOUNDED), _UNBOUNDED))
+            out.append(min(max(bound, -UNBOUNDED), UNBOUNDED))
     return low, high

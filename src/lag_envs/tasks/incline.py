@@ -192,7 +192,7 @@ it.
         return xp.exp(-(off * off)) - 0.02 * (effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cylinder is within 5 cm of the mark."""
+        """Return whether the cylinder is within 5 cm of the mark."""
         return xp.abs(after.x - target.target) <= 0.05
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
@@ -201,7 +201,7 @@ it.
         return {"off at the end [mm], median": float(np.median(off))}
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cylinder has left the plane."""
+        """Return whether the cylinder has left the plane."""
         return xp.abs(after.x) > self.edge
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -427,13 +427,13 @@ crosses a little too early and too fast, which costs more than the time it saves
         return -time - self.price * xp.maximum(speed - self.gentle, 0.0)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cylinder is across the line, slowly."""
+        """Return whether the cylinder is across the line, slowly."""
         return (after.x >= 0.0) & (after.x_dot <= 0.55)
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
         """Return when and how fast the line is crossed."""
         last, each = played.steps - 1, np.arange(len(played.steps))
-        before = self.formulas._state(played.states[last, each].T)
+        before = self.formulas.named_state(played.states[last, each].T)
         control = self.limit_control * (0.5 + 0.5 * np.clip(played.actions[last, each, 0], -1.0, 1.0))
         with np.errstate(divide="ignore", invalid="ignore"):  # without a brake, in branches not taken
             time, speed = self.crossing(before, [control], self.dt, np)
@@ -447,7 +447,7 @@ crosses a little too early and too fast, which costs more than the time it saves
         }
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the line has been crossed."""
+        """Return whether the line has been crossed."""
         return after.x >= 0.0
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

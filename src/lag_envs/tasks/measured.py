@@ -11,12 +11,12 @@ from typing import Any
 FILE = Path(__file__).with_name("measured.json")
 
 
-def measured(env_id: str) -> dict[str, Any]:
+def measured_entry(env_id: str) -> dict[str, Any]:
     """Return the file's entry for an environment; empty for one that was never measured."""
     return _envs(FILE).get(env_id, {})
 
 
-def known() -> list[str]:
+def measured_ids() -> list[str]:
     """Return the measured ids, in the order in which they were added."""
     return list(_envs(FILE))
 

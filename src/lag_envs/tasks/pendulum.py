@@ -306,5 +306,5 @@ class PendulumRegret(_Rod):
         return self.value(before, xp) - self.value(after, xp) - self.penalty * off * off
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the rod is within 0.1 rad of upright."""
+        """Return whether the rod is within 0.1 rad of upright."""
         return xp.cos(after.theta) >= math.cos(0.1)

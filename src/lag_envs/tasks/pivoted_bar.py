@@ -184,7 +184,7 @@ on most seeds, with a fifth of PPO's steps.
         return height * height - 0.02 * (effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the bar is within 0.2 rad of upright."""
+        """Return whether the bar is within 0.2 rad of upright."""
         return xp.cos(after.theta) <= -math.cos(0.2)
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -502,7 +502,7 @@ the bar in about the same number of episodes.
         return 1.0 - 0.5 * (e * e) - 0.5 * (s * s)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the bar has fallen or the support has left the track."""
+        """Return whether the bar has fallen or the support has left the track."""
         return (xp.abs(after.theta - math.pi) > self.largest_angle) | (xp.abs(after.s) > self.track)
 
     def behaviour(self, played: Any) -> Mapping[str, float]:

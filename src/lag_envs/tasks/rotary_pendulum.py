@@ -152,7 +152,7 @@ class RotarySwingUp(Task):
         return height * height * (0.8 + 0.2 * xp.cos(after.phi)) * (1.0 - 0.1 * effort * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the pendulum is within 0.2 rad of upright."""
+        """Return whether the pendulum is within 0.2 rad of upright."""
         return xp.cos(after.theta) <= -math.cos(0.2)
 
     def bodies(self) -> Bodies:

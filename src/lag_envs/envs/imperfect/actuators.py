@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from lag_envs.envs.imperfect.draws import key_of, noise
+from lag_envs.envs.imperfect.draws import noise, purpose_key
 from lag_envs.envs.imperfect.rows import Ring, RowsWithRings
-from lag_envs.envs.lines import recorded
-from lag_envs.stepping.flows import split
+from lag_envs.envs.lines import recorded_lines
+from lag_envs.stepping.flows import split_lengths
 from lag_envs.tasks.imperfections import Imperfections
 
 
@@ -53,7 +53,7 @@ class Actuators:
             return formulas.wanted(xp, list(values))
 
         def limited(xp: Any, *values: Any) -> list:
-            actions, old, (h,), rest = split(values, len(a), len(a), 1)
+            actions, old, (h,), rest = split_lengths(values, len(a), len(a), 1)
             at, reached = dict(zip(constants, rest, strict=True)), []
             for i, (u, c) in enumerate(zip(formulas.wanted(xp, actions), old, strict=True)):
                 if options.slew[i] < math.inf:
@@ -63,12 +63,12 @@ class Actuators:
             return reached
 
         def guarded(xp: Any, *values: Any) -> Sequence:
-            w, y_now, rest = split(values, len(a), len(y))
+            w, y_now, rest = split_lengths(values, len(a), len(y))
             k = SimpleNamespace(**dict(zip(constants, rest, strict=True)))
             return formulas.guarded(xp, w, y_now, k)
 
         def record(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
-            return recorded(formula, inputs, outputs, formulas.trace)
+            return recorded_lines(formula, inputs, outputs, formulas.trace)
 
         wanted = [f"w{i}" for i in range(len(a))]
         #: From the command in force to the control: ``a``, ``c``, ``y``, ``h`` to ``u``.
@@ -101,7 +101,7 @@ class Actuators:
             return []
         low, high = self._constants["late_low"], self._constants["late_high"]
         shortest, longest = self._options.action_delay
-        draw = f" + ({high} - {low}) * uniform({key_of('delay')}, np.uint64(n), np.uint64(0))"
+        draw = f" + ({high} - {low}) * uniform({purpose_key('delay')}, np.uint64(n), np.uint64(0))"
         late = f"{low}{draw if shortest < longest else ''}"
         return [
             "now = np.int64(n)",

@@ -6,13 +6,16 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.envs.imperfect.twice import Functions, Twice, rounded
+from lag_envs.envs.imperfect.twice import Twice, TwiceFunctions, nearest_float
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import formula as naming
-from lag_envs.mechanics.recording import parameter, twin
+from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values, twin
+from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import record_block
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.general import stepper_of
+from lag_envs.stepping.lag import lagged_stepper
+from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.tasks.base import Task
 
 
@@ -29,16 +32,16 @@ class DerivedConstants:
         self._task, self._draws, self._made = drawn.inner, drawn.draws, drawn.made
         self._scene = self._task.scene
         self._lags = bool(task.imperfections and task.imperfections.lag)
-        inner = {name: getattr(self._scene, name) for name in self._scene._numbers()}
+        inner = parameter_values(self._scene)
         trace = ElementaryTrace()
         for d in self._draws:
             inner[d.name] = trace.inputs(d.name)[0]
         self._follow(inner)
-        parameters = {n for n, x in inner.items() if isinstance(x, Number)}
+        parameters = {n for n, x in inner.items() if isinstance(x, TracedNumber)}
         found = self._task.formulas.starts_of(inner) | {f"self_{n}": x for n, x in inner.items()}
         found |= {n: x for n, x in self._motion(trace, inner, parameters).items() if n not in absent}
         #: Constants that change from episode to episode.
-        self.changed = [name for name, x in found.items() if isinstance(x, Number)]
+        self.changed = [name for name, x in found.items() if isinstance(x, TracedNumber)]
         self._parameters = parameters
 
     def _follow(self, numbers: dict[str, Any]) -> None:
@@ -49,24 +52,24 @@ class DerivedConstants:
 
     def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
         """Return the constants of the motion that depend on changing parameters."""
-        form, scene = self._scene._form, self._scene
+        form, scene = form_of(self._scene), self._scene
         below = {s.name for s in form.inertia.symbols()} if form else set()
-        wanted = dict(form.expressions if form else scene._stepper.expressions())
+        wanted = dict(form.expressions if form else stepper_of(scene.mechanics).expressions())
         wanted = {n: e for n, e in wanted.items() if changed & ({s.name for s in e.symbols()} | below)}
-        lagged = scene._lagged.expressions() if self._lags else {}
+        lagged = lagged_stepper(scene.mechanics).expressions() if self._lags else {}
         lagged = {f"lagged_{n}": e for n, e in lagged.items() if changed & {s.name for s in e.symbols()}}
         values = {
-            parameter(name): Twice(x) if isinstance(x, Number) else Fraction(x)
+            parameter(name): Twice(x) if isinstance(x, TracedNumber) else Fraction(x)
             for name, x in numbers.items()
-            if isinstance(x, Number) or math.isfinite(x)
+            if isinstance(x, TracedNumber) or math.isfinite(x)
         }
-        functions = Functions(trace)
+        functions = TwiceFunctions(trace)
         found = evaluate(list(wanted.values()), values, functions)
         if form:
             (inertia,) = evaluate([form.inertia], values, functions)
             found = [x / inertia for x in found]
         found += evaluate(list(lagged.values()), values, functions)
-        return {name: rounded(x) for name, x in zip([*wanted, *lagged], found, strict=True)}
+        return {name: nearest_float(x) for name, x in zip([*wanted, *lagged], found, strict=True)}
 
     def lines(self, constants: dict[str, Any]) -> list[str]:
         """Return the lines that draw parameters from ``share0``, ... and fill in the constants."""
@@ -99,7 +102,7 @@ class DerivedConstants:
     def _given(self, trace: Any, constants: dict[str, Any]) -> dict[str, Any]:
         """Return all parameters as inputs, but zeros as zero."""
         numbers: dict[str, Any] = {}
-        for name in self._scene._numbers():
+        for name in parameter_names(self._scene):
             at = constants[f"self_{name}"]
             numbers[name] = trace.inputs(at)[0] if isinstance(at, str) else 0.0
         for d in self._draws:

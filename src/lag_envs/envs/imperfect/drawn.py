@@ -1,11 +1,11 @@
-"""Parameters that are drawn anew for each episode."""
+"""Parameters that are redrawn for each episode."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from lag_envs.envs.imperfect.derived import DerivedConstants
-from lag_envs.envs.imperfect.draws import key_of
+from lag_envs.envs.imperfect.draws import purpose_key
 from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.program import Program
 from lag_envs.tasks.base import Task
@@ -50,7 +50,7 @@ class DrawnProgram(Program):
     def _start(self) -> list[str]:
         draws = (f"uniform(key_parameters, np.uint64(0), np.uint64({j}))" for j in range(len(self.p)))
         return [
-            *([f"key_parameters = {key_of('parameters')}"] if self.p else []),
+            *([f"key_parameters = {purpose_key('parameters')}"] if self.p else []),
             *(f"share{j} = {draw}" for j, draw in enumerate(draws)),
             *self.begin,
             *super()._start,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lag_envs.envs.lines import recorded
+from lag_envs.envs.lines import recorded_lines
 from lag_envs.envs.program import DRAWS
 from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks.imperfections import normals
@@ -14,7 +14,7 @@ from lag_envs.tasks.imperfections import normals
 PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
 
 
-def key_of(purpose: str) -> str:
+def purpose_key(purpose: str) -> str:
     """Return the key of an episode's draws for a purpose."""
     return f"episode_key(key, np.uint64({PURPOSES[purpose]}))"
 
@@ -48,7 +48,7 @@ def noise(
     def two(xp: Any, first: Any, second: Any) -> list:
         return normals(first, second, xp)
 
-    lines = [f"key_{purpose} = {key_of(purpose)}"]
+    lines = [f"key_{purpose} = {purpose_key(purpose)}"]
     per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step reserves this many times `DRAWS`
     names = list(sigmas)
     for i in range(0, len(values), 2):
@@ -58,6 +58,6 @@ def noise(
                 f"{x} = uniform(key_{purpose}, np.uint64(n) * np.uint64({per_step}), np.uint64({j}))"
                 for x, j in zip(("first", "second"), (i, i + 1), strict=True)
             ]
-            lines += recorded(two, ["first", "second"], ["normal0", "normal1"], trace)
+            lines += recorded_lines(two, ["first", "second"], ["normal0", "normal1"], trace)
             lines += [f"{values[j]} += {constants[names[j]]} * normal{j - i}" for j in pair]
     return lines

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from lag_envs.envs.program import constants_of
+from lag_envs.scenes.derivation import motion_constants_of, step_argument_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import seen_box
 
@@ -33,9 +34,9 @@ def numbers_of(task: Task) -> dict[str, float]:
     numbers["late_low"], numbers["late_high"] = found.action_delay
     if found.lag:
         scene = (task.drawn.inner if task.drawn else task).scene
-        numbers |= {f"lagged_{name}": x for name, x in scene._constants(lagged=True).items()}
+        numbers |= {f"lagged_{name}": x for name, x in motion_constants_of(scene, lagged=True).items()}
         numbers |= {f"decay{i}": x for i, x in enumerate(found.lag)}
-        numbers["lagged_order"] = scene._limit(task.dt, lagged=True)
+        numbers["lagged_order"] = step_argument_of(scene, task.dt, lagged=True)
     numbers["shown_at"] = (1.0 - found.observation_delay % 1.0) * task.dt
     return numbers | {"every": float(found.observation_every)}
 

@@ -13,9 +13,10 @@ from lag_envs.envs.imperfect.motion import Held, Lagged
 from lag_envs.envs.imperfect.pushes import pushes
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
-from lag_envs.envs.lines import function, indent, next_episode
+from lag_envs.envs.lines import compiled_lines, indent, next_episode
 from lag_envs.envs.program import SLOW
 from lag_envs.stepping.compiling import BLOCK
+from lag_envs.stepping.lag import lagged_stepper
 from lag_envs.tasks.base import Task
 
 
@@ -48,7 +49,9 @@ class ImperfectProgram(DrawnProgram):
         self._motion: Held | Lagged
         if found.lag:
             lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
-            self._lagged = scene._lagged.code(frozenset(n for n, x in lagged.items() if x == 0.0))
+            self._lagged = lagged_stepper(scene.mechanics).code(
+                frozenset(n for n, x in lagged.items() if x == 0.0)
+            )
             lift = formulas.lift("z")
             self._motion = Lagged(self._lagged, lift, self.n_state, self.y, self.z, self.u, constants)
         else:
@@ -89,7 +92,7 @@ class ImperfectProgram(DrawnProgram):
             "return r, np.int64(over)",
         ]  # fmt: skip
         advance = self._lagged.compile() if self._lagged else self.advance
-        return function("take", "f, base, stride, par, work, room, key", body, advance)
+        return compiled_lines("take", "f, base, stride, par, work, room, key", body, advance)
 
     @property
     def _through(self) -> list[str]:
@@ -142,7 +145,7 @@ class ImperfectProgram(DrawnProgram):
             *self._start, *actuators.begin(rows), *self._sensors.begin(rows),
             *rows.store([*self.y, *self.g, *self.u, *actuators.reached, "n", *self.drawn]),
         ]  # fmt: skip
-        return function("launch", "f, base, stride, par, key, state_given, target_given", body)
+        return compiled_lines("launch", "f, base, stride, par, key, state_given, target_given", body)
 
     # --- the functions of `Program` ------------------------------------------------------------------------
 
@@ -165,7 +168,7 @@ class ImperfectProgram(DrawnProgram):
             *(f"obs[{j}] = work[{n + j}]" for j in range(len(self.o))),
             "return r, over",
         ]  # fmt: skip
-        return function("step_one", "f, obs, a, ids", body, self.take)
+        return compiled_lines("step_one", "f, obs, a, ids", body, self.take)
 
     @cached_property
     def start_one(self) -> Callable:
@@ -176,7 +179,7 @@ class ImperfectProgram(DrawnProgram):
             "launch(f, np.int64(0), np.int64(1), par, key, state_given, target_given)",
             *(f"obs[{j}] = f[{self.kept.index(f'h{j}')}]" for j in range(len(self.o))),
         ]  # fmt: skip
-        return function("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
+        return compiled_lines("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
 
     def _each(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the environments of a block."""
@@ -226,7 +229,7 @@ class ImperfectProgram(DrawnProgram):
             ])),
         ]  # fmt: skip
         helpers = self.take, self.launch, *sharing.claiming()
-        return function("step_blocks", sharing.STEP_BLOCKS, body, *helpers, inner=True)
+        return compiled_lines("step_blocks", sharing.STEP_BLOCKS, body, *helpers, inner=True)
 
     def _at_lane(self, row: str) -> str:
         return f"f[base + {self.kept.index(row) * BLOCK}]"
@@ -249,4 +252,4 @@ class ImperfectProgram(DrawnProgram):
             ]),
         ]  # fmt: skip
         arguments = "f, ids, par, obs, mask, whole, state_given, target_given, count"
-        return function("start_all", arguments, body, self.launch)
+        return compiled_lines("start_all", arguments, body, self.launch)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lag_envs.envs.imperfect.draws import key_of
+from lag_envs.envs.imperfect.draws import purpose_key
 from lag_envs.tasks.imperfections import Imperfections
 
 
@@ -16,7 +16,7 @@ def pushes(options: Imperfections, constants: Mapping[str, Any]) -> list[str]:
         return []
     draws = (f"uniform(key_push, np.uint64(n), np.uint64({1 + j}))" for j in range(len(found)))
     return [
-        f"key_push = {key_of('push')}",
+        f"key_push = {purpose_key('push')}",
         f"if uniform(key_push, np.uint64(n), np.uint64(0)) < {constants['push_chance']}:",
         *(
             f"    y{i} = y{i} + {constants[f'push{i}']} * (2.0 * {draw} - 1.0)"

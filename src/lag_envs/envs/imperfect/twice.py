@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.tracing import TracedNumber
 from lag_envs.stepping.twofold import two_product, two_sum
 
 
@@ -49,18 +49,18 @@ class Twice:
 def _twice(value: Any) -> Twice:
     if isinstance(value, Twice):
         return value
-    if isinstance(value, Number):
+    if isinstance(value, TracedNumber):
         return Twice(value)
     exact = Fraction(value)
     return Twice(float(exact), float(exact - Fraction(float(exact))))
 
 
-def rounded(value: Any) -> Any:
+def nearest_float(value: Any) -> Any:
     """Return the nearest float."""
     return value.high + value.low if isinstance(value, Twice) else float(value)
 
 
-class Functions:
+class TwiceFunctions:
     """Functions of numbers with twice the digits, evaluated at the nearest floats."""
 
     Rational, mpf, pi = Fraction, None, Fraction(math.pi)
@@ -69,4 +69,4 @@ class Functions:
         self._trace = trace
 
     def __getattr__(self, name: str) -> Any:
-        return lambda x: Twice(getattr(self._trace, name)(rounded(x)))
+        return lambda x: Twice(getattr(self._trace, name)(nearest_float(x)))

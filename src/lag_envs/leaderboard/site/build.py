@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from lag_envs import store
 from lag_envs.leaderboard.site import driving
-from lag_envs.leaderboard.site.scenery import Scenery, describe
+from lag_envs.leaderboard.site.scenery import Scenery, scenery_data
 
 #: Lists the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
@@ -76,7 +76,7 @@ COLUMNS = (
 )
 
 
-def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
+def write_page(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     """Write the page.
 
     A browser that reads the old page meanwhile, or a kill at any moment, finds whole pages: scripts, styles
@@ -105,14 +105,14 @@ def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     before = _manifest(out)
     pages, files = render(data, url)
     wanted = {**files, **pages}
-    store.write(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
+    store.write_file(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
     for name, text in wanted.items():
         # The hash in its name covers the content, so an existing file need not be written again.
         if name in pages or not (out / name).is_file():
-            store.write(out / name, text)
+            store.write_file(out / name, text)
     for name in before - set(wanted):
         (out / name).unlink(missing_ok=True)
-    store.write(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
+    store.write_file(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
 
 
 def render(
@@ -169,7 +169,7 @@ def render(
         loader=PackageLoader("lag_envs.leaderboard.site"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    filters = {"number": number, "steps": steps, "duration": duration, "percent": percent}
+    filters = {"number": rounded_text, "steps": count_text, "duration": duration, "percent": percent}
     templates.filters |= filters | {"about": _about}
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
@@ -217,7 +217,7 @@ def _unused(name: str, taken: set[str]) -> str:
 def _about(row: Mapping[str, Any]) -> str:
     """Return a one-sentence summary of an agent."""
     place = "" if row["rank"] is None else f", rank {row['rank']}"
-    return f"{KINDS.get(row['kind'], row['kind'])}: score {number(row['score'])}{place}"
+    return f"{KINDS.get(row['kind'], row['kind'])}: score {rounded_text(row['score'])}{place}"
 
 
 def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, Any]:
@@ -239,7 +239,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "open": None,
         "drives": [],
     }
-    board |= {"protocol": protocol} | given | describe(given["id"])
+    board |= {"protocol": protocol} | given | scenery_data(given["id"])
     board["rows"] = [_row(dict(row)) for row in given["rows"]]
     board["page"] = _slug(str(given["id"]))
     if board["protocol"] != protocol:
@@ -261,7 +261,18 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     empty: dict[str, Any] = dict.fromkeys(
         [c.key for c in COLUMNS]
-        + ["interval", "license", "description", "hardware", "id", "above", "alike", "added", "agent", "module"]
+        + [
+            "interval",
+            "license",
+            "description",
+            "hardware",
+            "id",
+            "above",
+            "alike",
+            "added",
+            "agent",
+            "module",
+        ]
     )
     empty |= {"looks_like": "", "reference": False}
     row = empty | {"authors": [], "curves": [], "profile": [], "kind": "learned", "state": "verified"} | row
@@ -323,8 +334,8 @@ def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
     return value
 
 
-def number(value: Any, digits: int = 3) -> str:
-    """Return a number with so many digits after the point, fewer for large numbers.
+def rounded_text(value: Any, digits: int = 3) -> str:
+    """Return a number with this many digits after the point, fewer for large numbers.
 
     Examples
     --------
@@ -351,7 +362,7 @@ def percent(value: Any) -> str:
     return f"{100.0 * value:.1f}".removesuffix(".0") + "\N{NO-BREAK SPACE}%"
 
 
-def steps(value: Any) -> str:
+def count_text(value: Any) -> str:
     r"""Return a count as text.
 
     Examples

@@ -14,14 +14,16 @@ import numpy as np
 from lag_envs.controllers.basic import FeedbackLaw
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.architecture import Array, Head
-from lag_envs.leaderboard.grids import Table
+from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, Linear, Network
-from lag_envs.leaderboard.policies import Controller, Policy
-from lag_envs.leaderboard.site.scenery import picture
-from lag_envs.leaderboard.tracking import Plan
+from lag_envs.leaderboard.policies import ControllerPolicy, SubmittedPolicy
+from lag_envs.leaderboard.site.scenery import picture_data
+from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import parameter_names
 from lag_envs.replay import LEVELS, VERSION
 from lag_envs.scenes import StepRefused
+from lag_envs.scenes.derivation import form_of
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -78,7 +80,7 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
     formulas, rows = task.formulas, env.program.rows
     units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     resting = formulas.rest_action
-    form = task.scene._form
+    form = form_of(task.scene)
     return {
         "id": kind.id,
         "version": VERSION,
@@ -121,7 +123,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     `MARKS`.
     """
     task, program = env.task, env.program
-    names, units = list(program.given), dict(zip(task.scene._numbers(), _units(task), strict=True))
+    names, units = list(program.given), dict(zip(parameter_names(task.scene), _units(task), strict=True))
     fixed = {*program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
     values = {name: getattr(task.scene, name) for name in units if name not in fixed}
     marked = {
@@ -152,23 +154,23 @@ def _made(kind: type[Task], values: Mapping[str, float], marks: Sequence[float])
 
 
 def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
-    """Tell whether a script with changed parameters does the same as tasks made with them."""
+    """Return whether a script with changed parameters does the same as tasks made with them."""
     others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
     return bool(others) and all(_steps_as(env, list(values), other) for other in others)
 
 
 def _units(task: Task) -> list[str]:
     fields = type(task.scene).__dataclass_fields__
-    return [fields[name].metadata["unit"] for name in task.scene._numbers()]
+    return [fields[name].metadata["unit"] for name in parameter_names(task.scene)]
 
 
 def _look(task: Task) -> dict[str, Any]:
-    found = picture(Picture(task)) or {}
+    found = picture_data(Picture(task)) or {}
     return {key: found.get(key) for key in ("shapes", "window")}
 
 
 def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
-    """Tell whether a script with another task's parameters does the same as that task."""
+    """Return whether a script with another task's parameters does the same as that task."""
     if other.formulas.key != env.task.formulas.key or other.limit != env.task.limit:
         return False
     changed, own = Unfused(env.task, env.program), Unfused(other)
@@ -193,7 +195,7 @@ def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
 # --- agents -------------------------------------------------------------------------------------------------
 
 
-def agent(policy: Policy) -> dict[str, Any] | None:
+def agent(policy: SubmittedPolicy) -> dict[str, Any] | None:
     """Return a policy as the page runs it, in JSON types; None for one that only Python can run.
 
     The page runs networks, linear and time-varying feedback, and tables; of the controllers, only those that
@@ -205,11 +207,11 @@ def agent(policy: Policy) -> dict[str, Any] | None:
         The policy.
     """
     made = policy.architecture
-    if isinstance(made, Table) and made.task.imperfections:
+    if isinstance(made, GridArchitecture) and made.task.imperfections:
         return None  # it looks ahead on the environment without imperfections, which the page does not have
-    if isinstance(made, Network | Linear | Table):
+    if isinstance(made, Network | Linear | GridArchitecture):
         about, arrays, head = _learned(policy), policy.arrays, made.head
-    elif isinstance(made, Plan | Controller) and not made.plans:
+    elif isinstance(made, PlanArchitecture | ControllerPolicy) and not made.plans:
         acting = policy.agent()
         law = acting.law(made.task) if hasattr(acting, "law") else None
         if law is None:
@@ -224,12 +226,12 @@ def agent(policy: Policy) -> dict[str, Any] | None:
     }
 
 
-def _learned(policy: Policy) -> dict[str, Any]:
+def _learned(policy: SubmittedPolicy) -> dict[str, Any]:
     """Return the page's data about a policy whose arrays it uses as they are."""
     made: Any = policy.architecture
     if isinstance(made, Linear):
         return {"kind": "linear"}
-    if isinstance(made, Table):
+    if isinstance(made, GridArchitecture):
         return {
             "kind": f"{made.kind} table",
             "sums": made.sums.tolist(),

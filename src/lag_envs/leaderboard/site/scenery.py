@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.base import Scene
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Circle, Frame, Magnifier, Ruler, Shape
 from lag_envs.scores import share_of_privileged
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.measured import measured
+from lag_envs.tasks.measured import measured_entry
 
 #: Unit of states, actions and returns, which are shown with three digits.
 UNIT = 1e-4
@@ -29,7 +30,7 @@ UNIT = 1e-4
 LENGTH, ANGLE, PART = 1e-4, 2e-4, 2e-3
 
 
-def describe(env_id: str) -> dict[str, Any]:
+def scenery_data(env_id: str) -> dict[str, Any]:
     """Return the data with which the page describes and draws an environment.
 
     Parameters
@@ -70,7 +71,7 @@ def describe(env_id: str) -> dict[str, Any]:
         "state_units": list(task.scene.state_units),
         "pairs": _pairs(task.scene),
         "dt": task.dt,
-        "picture": picture(Picture(task)),
+        "picture": picture_data(Picture(task)),
     }
 
 
@@ -78,14 +79,15 @@ def _open(task: Task) -> dict[str, Any] | None:
     """Return what was tried on an open task, and how far it got."""
     if task.open is None:
         return None
-    found = measured(task.id).get("measured", {})
+    found = measured_entry(task.id).get("measured", {})
     tried = [[name, budget, found.get(name, {}).get("mean")] for name, budget in task.open.tried.items()]
     return {"knows": task.open.knows, "share": share_of_privileged(task.id), "tried": tried}
 
 
 def _pairs(scene: Scene) -> list[list[int]]:
     """Return the places of each coordinate and its rate in the state, free coordinates first."""
-    state, free = scene._layout.state, scene._layout.free
+    layout = layout_of(scene)
+    state, free = layout.state, layout.free
     found = [
         [i, j]
         for i, a in enumerate(state)
@@ -95,7 +97,7 @@ def _pairs(scene: Scene) -> list[list[int]]:
     return sorted(found, key=lambda pair: state[pair[0]].coordinate not in free)
 
 
-def picture(shown: Picture) -> dict[str, Any] | None:
+def picture_data(shown: Picture) -> dict[str, Any] | None:
     """Return the shapes of a picture in the form that ``site.js`` reads.
 
     Returns
@@ -129,7 +131,7 @@ class Scenery:
     def __init__(self, env_id: str) -> None:
         self._task: Task | None = TASKS[env_id]() if env_id in TASKS else None
         self._shown = Picture(self._task) if self._task else None
-        found = picture(self._shown) if self._shown else None
+        found = picture_data(self._shown) if self._shown else None
         self._units = found and found["units"]
 
     def episode(self, replay: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,9 +140,9 @@ class Scenery:
         states, actions = replay["states"][: steps + 1], replay["actions"][:steps]
         rewards = np.nan_to_num(np.array(replay["rewards"][:steps], np.float64))
         columns = {
-            "states": [column(x, UNIT) for x in _columns(states)],
-            "actions": [column(x, UNIT) for x in _columns(actions)],
-            "returns": column(np.concatenate([[0.0], np.cumsum(rewards)]), UNIT),
+            "states": [as_column(x, UNIT) for x in _columns(states)],
+            "actions": [as_column(x, UNIT) for x in _columns(actions)],
+            "returns": as_column(np.concatenate([[0.0], np.cumsum(rewards)]), UNIT),
         }
         kept = {key: value for key, value in replay.items() if key not in ("states", "actions", "rewards")}
         if "reset_seed" in kept:  # as a number, JavaScript would round it
@@ -182,12 +184,12 @@ class Scenery:
         frames = []
         found = shown.episode(np.array(states, np.float64), controls, target, dt)
         for poses in found.swapaxes(0, 1):
-            of = [column(x, unit) for x, unit in zip(poses.T, self._units, strict=True)]
+            of = [as_column(x, unit) for x, unit in zip(poses.T, self._units, strict=True)]
             frames.append([columns.setdefault(str(x), (len(columns), x))[0] for x in of])
         return {"columns": [x for _, x in columns.values()], "frames": frames}
 
 
-def column(values: ArrayLike, unit: float) -> int | list[int]:
+def as_column(values: ArrayLike, unit: float) -> int | list[int]:
     """Return numbers as a column.
 
     Examples

@@ -45,8 +45,8 @@ class FreeParameters:
         self.high = self.scaled([_limit(r, "below", "most", np.inf) for r in ranges])
         made = [n for n, f in fields.items() if f.metadata.get("made") and n not in names]
         self._fixed = {n: getattr(scene, n) for n in fields if n not in made}
-        anew = type(scene)(**self._fixed)
-        self._followers = tuple(n for n in made if getattr(anew, n) == getattr(scene, n) is not None)
+        again = type(scene)(**self._fixed)
+        self._followers = tuple(n for n in made if getattr(again, n) == getattr(scene, n) is not None)
         self._fixed |= {n: getattr(scene, n) for n in made if n not in self._followers}
 
     def scaled(self, values: Any) -> Array:

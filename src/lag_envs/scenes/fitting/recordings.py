@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.checks import check_sequence, check_step, real_array, shown
+from lag_envs.scenes.derivation import layout_of
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
@@ -102,7 +103,7 @@ def _controls(scene: Scene, controls: Any, count: int) -> Array:
 
 def _unwrapped(scene: Scene, states: Array) -> Array:
     """Return the states, with angles that were measured within one turn made continuous."""
-    for i, entry in enumerate(scene._layout.state):
+    for i, entry in enumerate(layout_of(scene).state):
         seen = np.isfinite(states[:, i])
         angles = states[seen, i]
         angle = entry.kind == "place" and entry.unit == "rad"
@@ -122,7 +123,7 @@ def guess(scene: Scene, recording: Recording) -> Array:
     place; a place that was not measured is the integral of the rate from 0.
     """
     dt, count = recording.dt, len(recording.states)
-    entries = scene._layout.state
+    entries = layout_of(scene).state
     known: dict[tuple[str, bool], tuple[Array, Array]] = {}
     for i, entry in enumerate(entries):
         seen = np.flatnonzero(recording.measured[:, i])

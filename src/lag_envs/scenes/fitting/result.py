@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.fitting.recordings import Recording
-from lag_envs.tables import columns
+from lag_envs.tables import aligned
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
@@ -82,7 +82,7 @@ class Fit:
         count = sum(int(r.measured.sum()) for r in self.recordings)
         counted = f"{len(self.recordings)} recording{'s' * (len(self.recordings) > 1)}"
         one = f"{type(self.scene).__name__}: {counted}, {count} values; noise {noise}"
-        return "\n".join([one, *columns(rows), *(f"! {text}" for text in self.warnings)])
+        return "\n".join([one, *aligned(rows), *(f"! {text}" for text in self.warnings)])
 
     def plot(self) -> Any:
         """Return a Matplotlib figure: data and model of each measured state, residuals, their histogram."""

@@ -1,0 +1,121 @@
+"""What follows from a scene and stays inside the package: its layout, its constants, the code of its steps.
+
+These are functions, not attributes, so that scenes may use any name for a parameter. What takes long to
+compute is kept with the scene, under a name with an underscore.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any
+
+from lag_envs.mechanics import motion, recording
+from lag_envs.mechanics.layout import SceneLayout, make_layout
+from lag_envs.mechanics.motion import Mechanics
+from lag_envs.mechanics.recording import parameter_names, parameter_values
+from lag_envs.scenes.declaring import MAPPINGS, ORDER, SEQUENCES, controls_of
+
+if TYPE_CHECKING:
+    from lag_envs.scenes.base import Scene
+    from lag_envs.stepping.normal_forms import NormalForm
+
+
+def layout_of(scene: Scene) -> SceneLayout:
+    """Return the names of coordinates, controls and state."""
+    found = vars(scene).get("_cached_layout")
+    if found is None:
+        # Properties may branch on structural fields and use them as counts, but not parameters.
+        copy, declared = recording.symbolic_twin(scene), {}
+        for name in (*MAPPINGS, *SEQUENCES):
+            with recording.formula(scene, name):
+                declared[name] = getattr(copy, name)
+        controls, absent = controls_of(scene, declared.pop("modes"), declared.pop("controls"))
+        found = make_layout(type(scene).__name__, controls=controls, absent=absent, **declared)
+        vars(scene)["_cached_layout"] = found
+    return found
+
+
+def structure_of(scene: Scene) -> tuple:
+    """Return everything that decides the code of a step; scenes that agree in it differ only in numbers."""
+    cls, numbers = type(scene), parameter_names(scene)
+    # By identity: keeping a formula that calls super() would keep its own class alive.
+    formulas = tuple(id(getattr(cls, name)) for name in ("rests", *recording.ARGUMENTS))
+    fields = dataclasses.fields(scene)  # type: ignore[arg-type]
+    plain = tuple((f.name, getattr(scene, f.name)) for f in fields if "unit" not in f.metadata)
+    zero = tuple(name for name in numbers if getattr(scene, name) == 0.0)
+    return formulas, plain, numbers, zero
+
+
+def mechanics_with(scene: Scene, parameters: tuple[str, ...]) -> Mechanics:
+    """Return the equations of motion with these parameters kept in them, even if they are 0."""
+    if not set(parameters) & set(scene.mechanics.zeros):
+        return scene.mechanics
+    known = vars(scene).setdefault("_cached_mechanics_with", {})
+    if parameters not in known:
+        layout = layout_of(scene)
+        known[parameters] = motion.derive_motion(
+            scene, layout, recording.record_scene(scene, layout), parameters
+        )
+    return known[parameters]
+
+
+def form_of(scene: Scene) -> NormalForm | None:
+    """Return the equation of motion's normal form if it has an exact flow of its own, else None."""
+    from lag_envs.stepping.normal_forms import normal_form
+
+    return normal_form(scene.mechanics)
+
+
+def motion_constants_of(scene: Scene, lagged: bool = False) -> dict[str, float]:
+    """Return the numbers that a step needs, computed from the parameters."""
+    kept = "_cached_lagged_constants" if lagged else "_cached_constants"
+    found = vars(scene).get(kept)
+    if found is None:
+        found = _stepper(scene, lagged).constants(parameter_values(scene))
+        for name, value in found.items():
+            if not math.isfinite(value):
+                raise ValueError(
+                    f"these parameters make a coefficient of the motion, {name}, {value}: {scene}"
+                )
+        vars(scene)[kept] = found
+    return found
+
+
+def _stepper(scene: Scene, lagged: bool) -> Any:
+    """Return what steps the scene: its normal form or the general series, always the latter if lagged."""
+    if lagged:
+        from lag_envs.stepping.lag import lagged_stepper
+
+        return lagged_stepper(scene.mechanics)
+    if form := form_of(scene):
+        return form
+    from lag_envs.stepping.general import stepper_of
+
+    return stepper_of(scene.mechanics)
+
+
+def order_of(scene: Scene, dt: float, lagged: bool = False) -> int:
+    """Return the order of the series for a control step; 0 for a closed form, which is never lagged."""
+    form = None if lagged else form_of(scene)
+    return form.order(dt) if form else series_order_of(scene, dt)
+
+
+def series_order_of(scene: Scene, dt: float) -> int:
+    """Return the order of the general series for a control step."""
+    from lag_envs.stepping.general import usual_order
+
+    return vars(scene).get(ORDER) or usual_order(dt)
+
+
+def step_argument_of(scene: Scene, dt: float, lagged: bool = False) -> float:
+    """Return the argument of a step besides dt: the largest x of one series, or the series' order."""
+    form = None if lagged else form_of(scene)
+    return form.largest_majorant(dt) if form else float(series_order_of(scene, dt))
+
+
+def code_of(scene: Scene, dt: float, lagged: bool = False) -> Any:
+    """Return the code of a control step."""
+    absent = frozenset(name for name, value in motion_constants_of(scene, lagged).items() if value == 0.0)
+    form = None if lagged else form_of(scene)
+    return form.stepper(dt, absent) if form else _stepper(scene, lagged).code(absent)

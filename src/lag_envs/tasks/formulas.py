@@ -1,0 +1,492 @@
+"""A task's formulas: checked, run on recorded numbers, and with the numbers that they take."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import Values, formula, parameter_names, twin
+from lag_envs.scenes.checks import StepRefused, check_number
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of
+from lag_envs.scenes.door import is_own
+from lag_envs.scenes.steps import refusal
+from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.flows import lift_lines
+from lag_envs.stepping.general import stepper_of
+
+if TYPE_CHECKING:
+    from lag_envs.stepping.normal_forms import NormalForm
+    from lag_envs.tasks.base import Task
+
+#: Names of the formulas of a task.
+FORMULAS = ("guard", "observe", "reward", "last_reward", "terminated", "kick")
+#: Bounds of an observation that has none.
+UNBOUNDED = float(np.finfo(np.float32).max)
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetBox:
+    """The range of a random target."""
+
+    name: str
+    unit: str
+    centre: float
+    half: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Acting:
+    """How a control follows from an action: ``low + (high - low)(a + 1)/2``, or one of `values`."""
+
+    control: str
+    low: float
+    high: float
+    values: tuple[float, ...] = ()
+
+
+class RecordedStep(NamedTuple):
+    """The parts of a step that a task can access while its formulas are recorded."""
+
+    k: Any
+    form: NormalForm | None
+    chance: Callable[[float], Any]
+
+
+class Lifted:
+    """The namespace ``xp`` with known cosines and sines of angles.
+
+    Parameters
+    ----------
+    xp : namespace
+        Computes everything else.
+    known : sequence of (angle, cosine, sine)
+        An angle is recognised by identity: it is the very object that a formula gets.
+    """
+
+    def __init__(self, xp: Any, known: Sequence[tuple[Any, Any, Any]]) -> None:
+        self._xp, self._known = xp, known
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._xp, name)
+
+    def cos(self, x: Any) -> Any:
+        """Return the cosine."""
+        for angle, c, _ in self._known:
+            if angle is x:
+                return c
+        return self._xp.cos(x)
+
+    def sin(self, x: Any) -> Any:
+        """Return the sine."""
+        for angle, _, s in self._known:
+            if angle is x:
+                return s
+        return self._xp.sin(x)
+
+
+#: Observations and chances of tasks whose formulas have been run: by class, and by `TaskFormulas.key`.
+_checked: weakref.WeakKeyDictionary[type, dict[tuple, tuple]] = weakref.WeakKeyDictionary()
+
+#: Attributes of a task whose numbers reach its code as constants, if at all.
+_NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imperfections", "drawn"}
+
+
+class TaskFormulas:
+    """The formulas of a task, as `lag_envs.envs.program` uses them.
+
+    If the scene has a normal form, states ``y`` and ``z`` are lifted: cosine and sine of its angle follow.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    base : type
+        The class that all tasks are derived from.
+    """
+
+    trace = ElementaryTrace
+
+    def __init__(self, task: Task, base: type[Task]) -> None:
+        self._task, self._base = task, base
+        self._chances: dict[float, str] = {}
+        scene = task.scene
+        self._form = form_of(scene)
+        #: Whether the step takes the constant ``x``: the largest one of one series, or the series' order.
+        self.bounded = self._form is None or bool(self._form.order(task.dt))
+        self.state = scene.state_names
+        self._controls = scene.control_names
+        self.controls = len(self._controls)
+        self.acting = _acting(task)
+        self.actions = len(self.acting)
+        self.choices = tuple(len(a.values) for a in self.acting if a.values)
+        if self.choices and len(self.choices) != self.actions:
+            raise FormulaError(
+                f"{type(task).__name__}.action mixes lists of values with ranges; "
+                "give every control a list, or every control a range"
+            )
+        self.clipped = not self.choices
+        #: The action of the largest control.
+        self.largest = float(task.largest_action)
+        if not 0.0 < self.largest < math.inf:
+            raise FormulaError(
+                f"{type(task).__name__}.largest_action must be above 0 and finite, "
+                f"got {task.largest_action!r}"
+            )
+        self.target_boxes = _target_boxes(task)
+        self.targets = len(self.target_boxes)
+        self.draws = task.draws
+        self.starts = _starts(task)
+        self.has_last = type(task).last_reward is not base.last_reward
+        known = _checked.setdefault(type(task), {})
+        key = self.key
+        if key not in known or not is_own(type(task)):
+            known[key] = self._names(), self._chances
+        self.observation, self._chances = known[key]
+
+    # --- constants ------------------------------------------------------------------------------------------
+
+    def constants(self) -> dict[str, float]:
+        """Return every number that compiled functions take, by name."""
+        task, scene = self._task, self._task.scene
+        found = dict(motion_constants_of(scene))
+        found |= {f"self_{name}": float(getattr(scene, name)) for name in parameter_names(scene)}
+        for i, name in enumerate(self.state):
+            found[f"centre{i}"], found[f"half{i}"] = self.starts[name]
+        if task.fixed_target is not None:
+            found |= {f"goal{i}": float(value) for i, value in enumerate(task.fixed_target)}
+        found |= {name: task.chance(p) for p, name in self._chances.items()}
+        found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
+        return found | {"x": step_argument_of(scene, task.dt)}
+
+    def starts_of(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the nonzero constants of the start for other values of the parameters."""
+        k = SimpleNamespace(**self.constants())
+        vars(k).update({f"self_{name}": x for name, x in numbers.items()})
+        with formula(self._task, "start"):
+            given = dict(self.with_numbers(k).start)
+        found = {}
+        for i, name in enumerate(self.state):
+            if name in given:
+                pair = given[name] if isinstance(given[name], tuple) else (0.0, given[name])
+                found[f"centre{i}"], found[f"half{i}"] = pair
+        return found
+
+    @property
+    def key(self) -> tuple:
+        """What determines the code: tasks of a class that agree in it differ only in their numbers."""
+        scene = self._task.scene
+        kind = type(self._task)
+        formulas = tuple(getattr(kind, name) for name in FORMULAS)
+        plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
+        # Formulas may also use attributes of the task that were set by hand.
+        own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
+        shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
+        return scene.mechanics.key, self._task.variant, formulas, *plain, *own, *shared
+
+    def refusal(self, state: Any, control: Any, dt: float, trajectory: Any, where: str) -> StepRefused:
+        """Return the error for a step that was refused."""
+        found = self._task.imperfections
+        lagged = bool(found and found.lag)
+        return refusal(self._task.scene, state, control, dt, trajectory, where, lagged=lagged)
+
+    def stepper(self, absent: frozenset[str]) -> Any:
+        """Return the code of a control step."""
+        if self._form:
+            return self._form.stepper(self._task.dt, absent)
+        return stepper_of(self._task.scene.mechanics).code(absent)
+
+    # --- formulas -------------------------------------------------------------------------------------------
+
+    def with_numbers(self, k: Any) -> Task:
+        """Return a copy of the task with recorded numbers."""
+        task = copy.copy(self._task)
+        for name in ("formulas", "drawn"):
+            vars(task).pop(name, None)
+        names = parameter_names(self._task.scene)
+        task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
+        task.dt = k.dt
+        task._recording = RecordedStep(
+            k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
+        )
+        return task
+
+    def _known(self, xp: Any, *states: Sequence) -> Any:
+        """Return the namespace that knows cosine and sine of the states' angles."""
+        if self._form is None or self._form.angle is None:
+            return xp
+        return Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
+
+    def named_state(self, y: Sequence) -> Values:
+        """Return the entries of a state by name, and the velocities by coordinate."""
+        layout = layout_of(self._task.scene)
+        names = dict(zip(self.state, y, strict=False))
+        rates = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
+        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates)}
+        return Values("entry of the state", names, hidden)
+
+    def named_targets(self, g: Sequence) -> Values:
+        """Return the targets by name."""
+        return Values("target", dict(zip((t.name for t in self.target_boxes), g, strict=True)))
+
+    def _applied(self, u: Sequence) -> Values:
+        return Values("control", dict(zip(self._controls, u, strict=True)))
+
+    def _call(self, name: str, k: Any, *arguments: Any) -> Any:
+        with formula(self._task, name):
+            return getattr(self.with_numbers(k), name)(*arguments)
+
+    def action(self, control: Any) -> Any:
+        """Return the unclipped action that requests a control; for tasks with one control."""
+        (acting,) = self.acting
+        if acting.low == -acting.high:
+            return self.largest * (control / acting.high)
+        return self.largest * (2.0 * ((control - acting.low) / (acting.high - acting.low)) - 1.0)
+
+    def shares(self, actions: Sequence) -> Sequence:
+        """Return actions as shares of the largest one; choices are unchanged."""
+        if self.choices or self.largest == 1.0:
+            return actions
+        return [a * (1.0 / self.largest) for a in actions]
+
+    def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
+        """Return the controls that are applied."""
+        return self.guarded(xp, self.wanted(xp, a), y, k)
+
+    def wanted(self, xp: Any, a: Sequence) -> list:
+        """Return the controls that actions request, one for each that actions set."""
+        shares = zip(self.acting, self.shares(a), strict=True)
+        return [control_of(acting, share, xp) for acting, share in shares]
+
+    def guarded(self, xp: Any, asked: Sequence, y: Sequence, k: Any) -> list:
+        """Return the controls that are applied if these are requested."""
+        wanted = dict.fromkeys(self._controls, 0.0)
+        wanted |= {acting.control: u for acting, u in zip(self.acting, asked, strict=True)}
+        if type(self._task).guard is self._base.guard:
+            return list(wanted.values())
+        given = Values("control", wanted)
+        found = self._call("guard", k, given, self.named_state(y), k.dt, self._known(xp, y))
+        if isinstance(found, Values):
+            return list(found)
+        if not isinstance(found, Mapping):
+            if len(self.acting) != 1:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.guard must return controls by name, got {found!r:.60}"
+                )
+            found = {self.acting[0].control: found}
+        for name in found:
+            if name not in wanted:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.guard: there is no control {name!r}, "
+                    f"only {', '.join(wanted)}"
+                )
+        return list((wanted | dict(found)).values())
+
+    def outcome(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
+        """Return the reward, and whether the episode is over."""
+        ended = self._call("terminated", k, self.named_state(z), self.named_targets(g), self._known(xp, z))
+        return self.reward(xp, y, z, u, g, k), ended
+
+    def reward(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        """Return the reward of a step that goes on."""
+        return self._reward("reward", xp, y, z, u, g, k)
+
+    def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        """Return the reward of a step that terminates."""
+        return self._reward("last_reward", xp, y, z, u, g, k)
+
+    def _reward(self, name: str, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        xp = self._known(xp, y, z)
+        before, after = self.named_state(y), self.named_state(z)
+        value = self._call(name, k, before, after, self._applied(u), self.named_targets(g), k.dt, xp)
+        if value is None or isinstance(value, Mapping | Sequence):
+            raise FormulaError(
+                f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number"
+            )
+        return k.scale * value if self._task.scaled else value
+
+    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
+        """Return the state after a kick."""
+        added = self._call("kick", k, self.named_state(z), draws, self._known(xp, z))
+        after = dict(zip(self.state, z, strict=False))
+        for name, value in added.items():
+            if name not in after:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.kick: there is no entry {name!r} of the state, "
+                    f"only {', '.join(self.state)}"
+                )
+            after[name] = after[name] + value
+        angle = None if self._form is None else self._form.angle
+        if angle is None or self.state[angle] not in added:
+            return [*after.values(), *z[len(self.state) :]]
+        turned = after[self.state[angle]]
+        return [*after.values(), xp.cos(turned), xp.sin(turned)]
+
+    def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> list:
+        """Return the observation."""
+        found = self._call("observe", k, self.named_state(y), self.named_targets(g), self._known(xp, y))
+        if not isinstance(found, Mapping) or not found:
+            raise FormulaError(
+                f"{type(self._task).__name__}.observe must return numbers by name, in order, "
+                f"got {found!r:.60}"
+            )
+        return list(found.values())
+
+    def _names(self) -> tuple[str, ...]:
+        """Run all formulas once, for their errors and for the observation's names."""
+        trace = self.trace()
+
+        class Inputs:
+            def __getattr__(self, name: str) -> Any:
+                return trace.inputs(name)[0]
+
+        k = Inputs()
+        width = len(self.state) if self._form is None else self._form.width
+        y, z = ([trace.inputs(f"{letter}{i}")[0] for i in range(width)] for letter in "yz")
+        a = [trace.inputs(f"a{i}")[0] for i in range(self.actions)]
+        u = [trace.inputs(f"u{i}")[0] for i in range(self.controls)]
+        g = [trace.inputs(f"g{i}")[0] for i in range(self.targets)]
+        self.control(trace, a, y, g, k)
+        self.outcome(trace, y, z, u, g, k)
+        if self.has_last:
+            self.last(trace, y, z, u, g, k)
+        if self.draws:
+            self.kick(trace, [trace.inputs(f"d{i}")[0] for i in range(self.draws)], z, k)
+        self.observe(trace, y, g, k)
+        return tuple(self._call("observe", k, self.named_state(y), self.named_targets(g), trace))
+
+    def sample_targets(self, draws: Sequence, k: Any) -> list:
+        """Return targets from draws in [0, 1)."""
+        if self._task.fixed_target is not None:
+            return [k[f"goal{i}"] for i in range(self.targets)]
+        return [t.centre + t.half * (2.0 * d - 1.0) for t, d in zip(self.target_boxes, draws, strict=True)]
+
+    def lift(self, y: str) -> list[str]:
+        """Return the lines that complete the lifted state."""
+        return lift_lines(len(self.state), self._form.angle if self._form else None, y)
+
+    @property
+    def rest_action(self) -> Any:
+        """The action whose controls are nearest to 0."""
+        if self.choices:
+            found: Any = [int(np.argmin(np.abs(a.values))) for a in self.acting]
+        else:
+            found = [
+                self.largest * min(1.0, max(-1.0, -(a.high + a.low) / (a.high - a.low))) for a in self.acting
+            ]
+        return found[0] if len(found) == 1 else found
+
+    def control_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the controls of the lowest and of the highest actions at the centre of the starts."""
+        k = SimpleNamespace(**self.constants())
+        y: Any = self._task.centre if self._form is None else self._form.lift(self._task.centre)
+        ends = ([0.0 for a in self.acting], [float(n - 1) for n in self.choices])
+        if not self.choices:
+            ends = ([-self.largest] * self.actions, [self.largest] * self.actions)
+        low, high = ends
+        found = (self.control(np, a, y, [0.0] * self.targets, k) for a in (low, high))
+        first, last = (np.array([float(u) for u in controls]) for controls in found)
+        return first, last
+
+    def box(self) -> tuple[list[float], list[float]]:
+        """Return the lowest and highest values of the observation's entries."""
+        given = dict(self._task.bounds())
+        for name in given:
+            if name not in self.observation:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.bounds: there is no observation {name!r}, "
+                    f"only {', '.join(self.observation)}"
+                )
+        low, high, unbounded = [], [], self._task.unbounded
+        for name in self.observation:
+            bound = given.get(name, unbounded)
+            pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
+            # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
+            low.append(float(pair[0]) if pair[0] > -UNBOUNDED else -unbounded)
+            high.append(float(pair[1]) if pair[1] < UNBOUNDED else unbounded)
+        return low, high
+
+
+def control_of(acting: Acting, a: Any, xp: Any) -> Any:
+    """Return the control that an action in [-1, 1], or a choice, requests."""
+    if acting.values:
+        value: Any = acting.values[-1]
+        for i in reversed(range(len(acting.values) - 1)):
+            value = xp.where(a < i + 0.5, acting.values[i], value)
+        return value
+    if acting.low == -acting.high:
+        return acting.high * a
+    return acting.low + (acting.high - acting.low) * (0.5 + 0.5 * a)
+
+
+def _numbers_of(where: str, value: Any) -> tuple[float, ...]:
+    try:
+        return tuple(check_number(where, v) for v in value)
+    except (TypeError, ValueError) as error:
+        raise FormulaError(f"{where}: {error}") from error
+
+
+def _mapping(task: Task, name: str) -> dict[str, Any]:
+    value = getattr(task if name != "target" else type(task), name)
+    if not isinstance(value, Mapping):
+        raise FormulaError(f"{type(task).__name__}.{name} must map names to numbers, got {value!r:.60}")
+    return dict(value)
+
+
+def _acting(task: Task) -> list[Acting]:
+    of, known = type(task).__name__, task.scene.control_names
+    found = []
+    for name, given in _mapping(task, "action").items():
+        where = f"{of}.action[{name!r}]"
+        if name not in known:
+            raise FormulaError(f"{where}: the scene has no such control, only {', '.join(known) or 'none'}")
+        if isinstance(given, list):
+            values = _numbers_of(where, given)
+            if len(values) < 2:
+                raise FormulaError(f"{where} must list at least two values, got {given!r}")
+            found.append(Acting(name, min(values), max(values), values))
+            continue
+        low, high = (
+            _numbers_of(where, given if isinstance(given, tuple) else (given,))
+            if isinstance(given, tuple)
+            else (-check_number(where, given), check_number(where, given))
+        )
+        if not low < high:
+            raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
+        found.append(Acting(name, low, high))
+    if known and not found:
+        raise FormulaError(f"{of}.action must give limits of controls, as in {{{known[0]!r}: 1.0}}")
+    return found
+
+
+def _target_boxes(task: Task) -> list[TargetBox]:
+    of, found = type(task).__name__, []
+    for name, given in _mapping(task, "target").items():
+        where = f"{of}.target[{name!r}]"
+        if not isinstance(given, tuple) or len(given) not in (2, 3) or not isinstance(given[0], str):
+            raise FormulaError(f"{where} must be (unit, half width), got {given!r:.60}")
+        *centre, half = _numbers_of(where, given[1:])
+        found.append(TargetBox(name, given[0], centre[0] if centre else 0.0, half))
+    return found
+
+
+def _starts(task: Task) -> dict[str, tuple[float, float]]:
+    of, names = type(task).__name__, task.scene.state_names
+    found = dict.fromkeys(names, (0.0, 0.0))
+    for name, given in _mapping(task, "start").items():
+        where = f"{of}.start[{name!r}]"
+        if name not in found:
+            raise FormulaError(f"{where}: the state has no such entry, only {', '.join(names)}")
+        if isinstance(given, tuple) and len(given) != 2:
+            raise FormulaError(f"{where} must be a half width or (centre, half width), got {given!r}")
+        pair = _numbers_of(where, given if isinstance(given, tuple) else (0.0, given))
+        found[name] = pair[0], pair[1]
+    return found
