@@ -77,7 +77,9 @@ def jobs(quick: bool) -> list[ReportJob]:
     ]
     count = 50 if quick else 500
     return made + [
-        ReportJob(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
+        ReportJob(
+            SECTION, f"balance, {name}", f"{SECTION}:energy_imbalance", {"variant": name, "steps": count}
+        )
         for name in (list(VARIANTS)[:1] if quick else VARIANTS)
     ]
 
