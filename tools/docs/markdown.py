@@ -34,12 +34,12 @@ def number_text(value: float) -> str:
     )
 
 
-def mean_and_error(mean: float, error: float) -> str:
+def mean_with_error(mean: float, error: float) -> str:
     """Return a mean with its standard error, which decides the digits.
 
     Examples
     --------
-    >>> mean_and_error(418.987, 0.0117), mean_and_error(0.000165, 0.0)
+    >>> mean_with_error(418.987, 0.0117), mean_with_error(0.000165, 0.0)
     ('418.987 ± 0.012', '0.0002 ± 0.0000')
     """
     digits = 4 if error <= 0.0 else max(0, 1 - math.floor(math.log10(error)))

@@ -142,7 +142,7 @@ class ExactEnd(NamedTuple):
             return math.inf
         return max(
             abs(e) / s
-            for e, s in zip(reference.differences(state.tolist(), self.end), self.scale, strict=True)
+            for e, s in zip(reference.state_differences(state.tolist(), self.end), self.scale, strict=True)
         )
 
 
