@@ -69,7 +69,8 @@ def times_to_levels(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
 
     Examples
     --------
-    >>> times([[(10, 1.0, 0.5), (20, 2.0, 0.95)]])["0.9"], times([[(10, 1.0, 0.5)]])["0.9"]
+    >>> late, never = [(10, 1.0, 0.5), (20, 2.0, 0.95)], [(10, 1.0, 0.5)]
+    >>> times_to_levels([late])["0.9"], times_to_levels([never])["0.9"]
     ({'seeds': 1, 'steps': 20.0, 'seconds': 2.0}, {'seeds': 0, 'steps': None, 'seconds': None})
     """
     found = {}

@@ -287,7 +287,7 @@ class GreedyPolicy(LookAhead):
     --------
     >>> import gymnasium as gym
     >>> from lag_envs.tasks.incline import Brake
-    >>> agent = Optimal(Brake.id, level=0.5, folder=None)
+    >>> agent = GreedyPolicy(Brake.id, level=0.5, folder=None)
     >>> observation, _ = gym.make(Brake.id).reset(seed=0)
     >>> action, taken = agent.predict(observation)
     >>> action, taken

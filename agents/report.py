@@ -423,7 +423,7 @@ def meaningful_digits(value: float) -> str:
 
     Examples
     --------
-    >>> number(0.98765), number(-3.21), number(417.923)
+    >>> meaningful_digits(0.98765), meaningful_digits(-3.21), meaningful_digits(417.923)
     ('0.988', '-3.21', '417.9')
     """
     digits = 3 if abs(value) < 2.0 else 2 if abs(value) < 100.0 else 1

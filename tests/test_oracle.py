@@ -470,7 +470,9 @@ def test_remembered(tmp_path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 1
     monkeypatch.setattr(reference, "exact_flow", None)  # not called again
     assert distance(reference.remembered(*problem), first) < 1e-38
-    assert reference.differences([float(x) for x in first], first) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert reference.state_differences([float(x) for x in first], first) == pytest.approx(
+        [0.0, 0.0], abs=1e-15
+    )
     with pytest.raises(TypeError):
         reference.remembered(*problem[:3], 0.03)
 

@@ -310,7 +310,9 @@ def test_subjects_are_the_scenes_of_tasks_and_the_others(write):
     assert [s.name for s in own.subjects(path + ":Other")] == ["Other"]
     with pytest.raises(UserError, match="has no task 'Pum'; did you mean Pump"):
         own.subjects(path + ":Pum")
-    names = [job.name for job in own.jobs(True, path)]
+    jobs = own.jobs(True, path)
+    assert all(callable(getattr(own, job.function.rpartition(":")[2])) for job in jobs)
+    names = [job.name for job in jobs]
     assert names == [
         f"{what}: {name}" for what in ("steps", "stability", "points") for name in ("Swing of Pump", "Other")
     ]

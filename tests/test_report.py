@@ -199,6 +199,8 @@ def test_sections_stand_without_rows(name):
     assert [claim.text for claim in content.claims if claim.holds is not None] == []
     jobs = module(name).jobs(True) + module(name).jobs(False)
     assert all(j.section == name for j in jobs)
+    for place, function in {tuple(j.function.split(":")) for j in jobs}:
+        assert callable(getattr(module(place), function)), (place, function)
     for some in (module(name).jobs(True), module(name).jobs(False)):
         assert len({j.name for j in some}) == len(some) > 0
 

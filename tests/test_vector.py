@@ -658,3 +658,12 @@ def test_a_refusal_carries_what_the_others_did():
 def test_impossible_max_episode_steps(steps):
     with pytest.raises(ValueError, match="max_episode_steps must be a whole number of at least 1"):
         gym.make_vec("PivotedBar-v0", num_envs=2, max_episode_steps=steps)
+
+
+def test_it_tells_limits_and_which_episodes_are_over():
+    envs = gym.make_vec("PivotedBar-v0", 3, max_episode_steps=2).unwrapped
+    envs.reset(seed=1)
+    assert envs.limits.tolist() == [2.0] * 3 and envs.ended is None and len(envs.tasks) == 3
+    for _ in range(2):
+        envs.step(envs.action_space.sample())
+    assert envs.ended.tolist() == [True] * 3

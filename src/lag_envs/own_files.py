@@ -37,7 +37,7 @@ def split_path(name: str) -> tuple[str, str]:
 
     Examples
     --------
-    >>> split("mine.py:Balance"), split("mine.py"), split(r"C:\mine.py")
+    >>> split_path("mine.py:Balance"), split_path("mine.py"), split_path(r"C:\mine.py")
     (('mine.py', 'Balance'), ('mine.py', ''), ('C:\\mine.py', ''))
     """
     path, colon, kind = name.rpartition(":")

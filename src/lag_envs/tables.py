@@ -11,7 +11,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
     Examples
     --------
-    >>> columns([("name", "return"), ("a", "1"), ("bc", "-23")])
+    >>> aligned([("name", "return"), ("a", "1"), ("bc", "-23")])
     ['name  return', 'a          1', 'bc       -23']
     """
     lines: list[list[str]] = [[] for _ in rows]

@@ -34,7 +34,7 @@ from tools.docs import equations
 from tools.docs.markdown import (
     default_text,
     first_line,
-    mean_and_error,
+    mean_with_error,
     number_text,
     parameter_descriptions,
     sections,
@@ -129,7 +129,7 @@ def overview(link: Callable[[str], str]) -> str:
                 first_line(type(task)),
                 "; ".join(_range(task, acting) for acting in task.formulas.acting),
                 *(
-                    mean_and_error(row["mean"], row["error"]) if row else "not measured yet"
+                    mean_with_error(row["mean"], row["error"]) if row else "not measured yet"
                     for row in map(found.get, ("random", best))
                 ),
             ]
@@ -371,7 +371,11 @@ def _returns(env_id: str) -> str:
     names["optimum"] = f"the optimum: {TASKS[env_id].optimum.text}" if TASKS[env_id].optimum else ""
     names["privileged"] = f"a reference that {TASKS[env_id].open.knows}" if TASKS[env_id].open else ""
     rows = [
-        [text, mean_and_error(row["mean"], row["error"]), f"{row['episodes']:,}" if "episodes" in row else ""]
+        [
+            text,
+            mean_with_error(row["mean"], row["error"]),
+            f"{row['episodes']:,}" if "episodes" in row else "",
+        ]
         for name, text in names.items()
         if (row := found["measured"].get(name))
     ]
@@ -392,7 +396,7 @@ def _open(env_id: str) -> str:
             f"{task.open.knows}. "
         )
     rows = [
-        [name, budget, mean_and_error(row["mean"], row["error"]) if (row := found.get(name)) else ""]
+        [name, budget, mean_with_error(row["mean"], row["error"]) if (row := found.get(name)) else ""]
         for name, budget in task.open.tried.items()
     ]
     return f"{text}Tried so far:\n\n{markdown_table(['Method', 'Budget', 'Return'], rows)}"

@@ -24,7 +24,7 @@ def number_text(value: float) -> str:
 
     Examples
     --------
-    >>> [number(x) for x in (0.02, 1e-06, 100000.0, 1e9, 3.14159265, math.inf, -0.0)]
+    >>> [number_text(x) for x in (0.02, 1e-06, 100000.0, 1e9, 3.14159265, math.inf, -0.0)]
     ['0.02', '1e-6', '100000', '1e9', '3.1416', '∞', '0']
     """
     if math.isinf(value):
@@ -34,12 +34,12 @@ def number_text(value: float) -> str:
     )
 
 
-def mean_and_error(mean: float, error: float) -> str:
+def mean_with_error(mean: float, error: float) -> str:
     """Return a mean with its standard error, which decides the digits.
 
     Examples
     --------
-    >>> plus_minus(418.987, 0.0117), plus_minus(0.000165, 0.0)
+    >>> mean_with_error(418.987, 0.0117), mean_with_error(0.000165, 0.0)
     ('418.987 ± 0.012', '0.0002 ± 0.0000')
     """
     digits = 4 if error <= 0.0 else max(0, 1 - math.floor(math.log10(error)))

@@ -234,7 +234,7 @@ def table(found: dict[str, Any]) -> str:
     return f"{about}\n\n{markdown_table(head, rows)}"
 
 
-def write_page(found: dict[str, Any]) -> None:
+def write_results(found: dict[str, Any]) -> None:
     """Write the results, and the table in the documentation."""
     RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     page = PAGE.read_text(encoding="utf-8")
@@ -265,7 +265,7 @@ def main(arguments: list[str] | None = None) -> int:
         rows_of = {n: [r for r in rows if r["key"] == n] or [r for r in old if r["key"] == n] for n in known}
         system = f"{platform.system()} {platform.machine()}"
         found = {"python": platform.python_version(), "system": system, "date": date.today().isoformat()}
-        write_page(found | {"rows": [row for n in known for row in rows_of[n]]})
+        write_results(found | {"rows": [row for n in known for row in rows_of[n]]})
     print()
     for row in rows:
         print(f"{row['library']} {row['version']}: {row['what']}: {outcome(row)}")

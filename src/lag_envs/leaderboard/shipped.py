@@ -106,9 +106,9 @@ def chosen_candidates(of: Iterable[Candidate], most: int = MOST) -> dict[str, Ca
     --------
     >>> large, small = Candidate("A", 1.0, 90, "a", 0, "table"), Candidate("A", 0.9, 10, "b", 0, "network")
     >>> other = Candidate("B", 1.0, 50, "c", 0, "table")
-    >>> sorted(c.name for c in chosen([large, small, other], 140).values())
+    >>> sorted(c.name for c in chosen_candidates([large, small, other], 140).values())
     ['table', 'table']
-    >>> sorted(c.name for c in chosen([large, small, other], 139).values())
+    >>> sorted(c.name for c in chosen_candidates([large, small, other], 139).values())
     ['network', 'table']
     """
     ranked = sorted(of, key=lambda c: (-c.score, c.size, c.submission, c.seed))

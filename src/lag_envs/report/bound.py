@@ -190,7 +190,7 @@ def _enough(
     for i in range(n):
         theta, omega, c, s = y
         y = pendulum.step(theta, omega, c, s, drive._replace(delta=drive.delta + drive.ramp * (i * h)), h)
-    return all(abs(e) <= m for e, m in zip(reference.differences(y[:2], exact), limits, strict=True))
+    return all(abs(e) <= m for e, m in zip(reference.state_differences(y[:2], exact), limits, strict=True))
 
 
 def environment(id: str, n: int) -> Iterator[Row]:

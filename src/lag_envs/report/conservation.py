@@ -77,7 +77,9 @@ def jobs(quick: bool) -> list[ReportJob]:
     ]
     count = 50 if quick else 500
     return made + [
-        ReportJob(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
+        ReportJob(
+            SECTION, f"balance, {name}", f"{SECTION}:energy_imbalance", {"variant": name, "steps": count}
+        )
         for name in (list(VARIANTS)[:1] if quick else VARIANTS)
     ]
 
@@ -172,7 +174,7 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
     errors, amplified = [], []
     for n, state in zip(at, states, strict=True):
         exact = reference.remembered(scene, start, 0.0, float(n) * dt)
-        errors.append(abs(reference.differences(state[:1], exact[:1])[0]))
+        errors.append(abs(reference.state_differences(state[:1], exact[:1])[0]))
         with mp.workdps(60):
             total = mpf(0)
             for j, value in enumerate(start):

@@ -133,7 +133,7 @@ def episode_errors(
     states, scale = episode.states, sizes(episode.states)
 
     def errors(states: Array, exact: list[list[mpf]]) -> Array:
-        each = np.array([reference.differences(a, b) for a, b in zip(states, exact, strict=True)])
+        each = np.array([reference.state_differences(a, b) for a, b in zip(states, exact, strict=True)])
         for i in wraps:
             each[:, i] = np.remainder(each[:, i] + math.pi, 2.0 * math.pi) - math.pi
         return np.abs(each)

@@ -213,7 +213,7 @@ def measure_extreme(name: str) -> Row:
     if extreme.expected == REFUSED:
         return row | {"outcome": "taken", "met": False, "message": ""}
     exact = reference.remembered(case.scene, case.state, case.control, extreme.dt)
-    errors = [abs(e) for e in reference.differences(end, exact)]
+    errors = [abs(e) for e in reference.state_differences(end, exact)]
     sizes, gains = scales(case, extreme.dt), amplification(case, extreme.dt)
     limits = [(EXACT * s, ROUNDINGS * EPS * g) for s, g in zip(sizes, gains, strict=True)]
     row["error"] = max(e / s for e, s in zip(errors, sizes, strict=True))

@@ -74,7 +74,13 @@ def jobs(quick: bool) -> list[ReportJob]:
     families = [f for f in FAMILIES if not (quick and f == "pinocchio")]
     count = 8 if quick else MEMBERS
     made = [
-        ReportJob(SECTION, f"exact: {name}", f"{SECTION}:exact", {"name": name, "count": count}, 900.0)
+        ReportJob(
+            SECTION,
+            f"exact: {name}",
+            f"{SECTION}:exact_ends_of_systems",
+            {"name": name, "count": count},
+            900.0,
+        )
         for name in names
     ]
     made += [
@@ -95,12 +101,18 @@ def jobs(quick: bool) -> list[ReportJob]:
     made.append(ReportJob(SECTION, "energy", f"{SECTION}:energy", {"quick": quick}, 600.0))
     alone = partial(ReportJob, SECTION, timeout=900.0, alone=True)
     made += [
-        alone(f"{family}: {name}", f"{SECTION}:points", {"name": name, "family": family, "quick": quick})
+        alone(
+            f"{family}: {name}", f"{SECTION}:system_points", {"name": name, "family": family, "quick": quick}
+        )
         for name in names
         for family in families
     ]
     made += [
-        alone(f"first step: {name}", f"{SECTION}:first", {"name": name, "rounds": 1 if quick else 3})
+        alone(
+            f"first step: {name}",
+            f"{SECTION}:first_step_seconds",
+            {"name": name, "rounds": 1 if quick else 3},
+        )
         for name in names
     ]
     return made

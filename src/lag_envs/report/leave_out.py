@@ -132,7 +132,7 @@ def assigned(line: str) -> list[str]:
 
     Examples
     --------
-    >>> made("a, b = block_1(c)"), made("y0 += dt")
+    >>> assigned("a, b = block_1(c)"), assigned("y0 += dt")
     (['a', 'b'], ['y0'])
     """
     head = re.match(r"([\w, ]+?) *[-+*/]?= ", line)

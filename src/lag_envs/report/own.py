@@ -170,12 +170,16 @@ def jobs(quick: bool, file: str = "") -> list[ReportJob]:
         ReportJob(
             SECTION,
             f"{what}: {name}",
-            f"{SECTION}:{what}",
+            f"{SECTION}:{function}",
             about | {"name": name},
             900.0,
             alone=what == "points",
         )
-        for what in ("steps", "stability", "points")
+        for what, function in (
+            ("steps", "shipped_steps"),
+            ("stability", "stability"),
+            ("points", "step_points"),
+        )
         for name in names
     ]
 

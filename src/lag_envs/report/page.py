@@ -83,7 +83,7 @@ def cell_text(value: Any) -> str:
 
     Examples
     --------
-    >>> [cell(x) for x in (None, True, 12345, 0.125, 1234.5, 1.5e-13, 0.0, "a")]
+    >>> [cell_text(x) for x in (None, True, 12345, 0.125, 1234.5, 1.5e-13, 0.0, "a")]
     ['', 'yes', '12,345', '0.125', '1,234', '1.5e-13', '0', 'a']
     """
     if value is None:

@@ -79,12 +79,12 @@ def exact_ends(scene: Scene, states: Array, controls: Array, dt: float) -> tuple
     """
     found = [remembered(scene, y, u, dt) for y, u in zip(states.tolist(), controls.tolist(), strict=True)]
     high = np.array(found, dtype=np.float64).reshape(states.shape)
-    return high, -np.array([differences(y, exact) for y, exact in zip(high, found, strict=True)]).reshape(
-        high.shape
-    )
+    return high, -np.array(
+        [state_differences(y, exact) for y, exact in zip(high, found, strict=True)]
+    ).reshape(high.shape)
 
 
-def differences(states: Sequence[float] | Array, exact: Sequence[mpf]) -> list[float]:
+def state_differences(states: Sequence[float] | Array, exact: Sequence[mpf]) -> list[float]:
     """Return the differences of a float64 state from the exact one."""
     with mp.workdps(40):
         return [float(mpf(float(a)) - b) for a, b in zip(states, exact, strict=True)]

@@ -196,7 +196,7 @@ def error_line(error: BaseException) -> str:
 
     Examples
     --------
-    >>> describe(ModuleNotFoundError("No module named 'heyoka'", name="heyoka"))
+    >>> error_line(ModuleNotFoundError("No module named 'heyoka'", name="heyoka"))
     'heyoka is not installed'
     """
     if isinstance(error, ModuleNotFoundError) and error.name:

@@ -88,7 +88,7 @@ def map_errors(map: str, name: str, dt: float, values: Sequence[float]) -> Itera
 def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
     """Return the largest error of an entry over the effect of one rounding of the start."""
     exact = reference.remembered(case.scene, case.state, case.control, dt)
-    errors, gains = reference.differences(end, exact), extremes.amplification(case, dt)
+    errors, gains = reference.state_differences(end, exact), extremes.amplification(case, dt)
     shares = [abs(e) / (extremes.EPS * g) for e, g in zip(errors, gains, strict=True) if g]
     return max(shares, default=None)
 
@@ -123,7 +123,7 @@ def largest_errors(case: Case, dt: float, ends: dict[str, Any]) -> Row:
             return end
         if not np.isfinite(end).all():
             return DIVERGED
-        error = max(abs(e) / s for e, s in zip(reference.differences(end, exact), sizes, strict=True))
+        error = max(abs(e) / s for e, s in zip(reference.state_differences(end, exact), sizes, strict=True))
         return error if error < FAR_OFF else DIVERGED
 
     return {"errors": {key: relative(end) for key, end in ends.items()}}

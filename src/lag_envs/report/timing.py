@@ -45,7 +45,7 @@ class FlowSteps:
     >>> bar = PivotedBar(track=None)
     >>> case = Case(bar, (3.0, 0.0), 1.0)
     >>> end = bar.simulate(case.state, [case.control] * 50, 0.02)[-1]
-    >>> Kernels(bar).end(case, 0.02, 50).tolist() == end.tolist()
+    >>> FlowSteps(bar).end(case, 0.02, 50).tolist() == end.tolist()
     True
     """
 

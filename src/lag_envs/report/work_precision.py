@@ -102,7 +102,7 @@ def jobs(quick: bool) -> list[ReportJob]:
             ReportJob(
                 SECTION,
                 f"{family}: {name}",
-                f"{SECTION}:points",
+                f"{SECTION}:variant_points",
                 {"variant": name, "family": family, "quick": quick},
                 timeout=600.0,
                 alone=True,
@@ -142,7 +142,7 @@ class ExactEnd(NamedTuple):
             return math.inf
         return max(
             abs(e) / s
-            for e, s in zip(reference.differences(state.tolist(), self.end), self.scale, strict=True)
+            for e, s in zip(reference.state_differences(state.tolist(), self.end), self.scale, strict=True)
         )
 
 
@@ -404,7 +404,7 @@ def observed_order(found: Mapping[float, Sequence[float]]) -> float | None:
 
     Examples
     --------
-    >>> slope({h: [h**5, 3 * h**5] for h in (0.1, 0.2)})
+    >>> observed_order({h: [h**5, 3 * h**5] for h in (0.1, 0.2)})
     4.0
     """
     lengths = sorted(found)

@@ -155,7 +155,7 @@ def split_lengths(values: Sequence, *sizes: int) -> list[list]:
 
     Examples
     --------
-    >>> split([1, 2, 3, 4], 1, 2)
+    >>> split_lengths([1, 2, 3, 4], 1, 2)
     [[1], [2, 3], [4]]
     """
     rest = iter(values)

@@ -374,7 +374,7 @@ def evaluate_operations(
     >>> trace = Trace()
     >>> a, b = trace.inputs("a", "b")
     >>> operations, results = trace.operations([a / b + 1.0], fused=False)
-    >>> evaluate(operations, {"a": 1.0, "b": -0.0})[results[0]]
+    >>> evaluate_operations(operations, {"a": 1.0, "b": -0.0})[results[0]]
     -inf
     """
     table = IEEE | dict(functions or {})

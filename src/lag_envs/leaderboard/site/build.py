@@ -339,8 +339,8 @@ def rounded_text(value: Any, digits: int = 3) -> str:
 
     Examples
     --------
-    >>> number(0.98765), number(-421.0), number(-1.7386), number(-1e-9), number(None)
-    ('0.988', '−421.0', '−1.739', '0.000', '–')
+    >>> [rounded_text(x) for x in (0.98765, -421.0, -1.7386, -1e-9, None)]
+    ['0.988', '−421.0', '−1.739', '0.000', '–']
     """
     if not isinstance(value, int | float) or isinstance(value, bool):
         return "–"
@@ -367,7 +367,7 @@ def count_text(value: Any) -> str:
 
     Examples
     --------
-    >>> steps(500_000), steps(1_250_000), steps(None)
+    >>> count_text(500_000), count_text(1_250_000), count_text(None)
     ('500\xa0k', '1.25\xa0M', '–')
     """
     if not isinstance(value, int | float):

@@ -48,9 +48,9 @@ def scenery_data(env_id: str) -> dict[str, Any]:
 
     Examples
     --------
-    >>> describe("PivotedBar-v0")["state_names"]
+    >>> scenery_data("PivotedBar-v0")["state_names"]
     ['s', 's_dot', 'theta', 'theta_dot']
-    >>> describe("Gone-v0")
+    >>> scenery_data("Gone-v0")
     {}
     """
     if env_id not in TASKS:
@@ -194,7 +194,7 @@ def as_column(values: ArrayLike, unit: float) -> int | list[int]:
 
     Examples
     --------
-    >>> column([0.5, 0.5, 0.5], 0.1), column([0.0, 1.0, 2.0, 3.0, 3.0], 1.0)
+    >>> as_column([0.5, 0.5, 0.5], 0.1), as_column([0.0, 1.0, 2.0, 3.0, 3.0], 1.0)
     (5, [0, 1, 0, 0, -1])
     """
     whole = np.rint(np.nan_to_num(np.asarray(values, np.float64)) / unit).astype(np.int64)
