@@ -47,7 +47,8 @@ def about(files):
     curves = [{"seed": 0, "steps": [0, 1000], "returns": [0.0, 100.0]}]
     return About(
         env=told["env"], name=told["name"], authors=tuple(told["authors"]), license="MIT", kind=told["kind"],
-        seeds=tuple(range(5 if told["kind"] == "learned" else 1)), architecture=SimpleNamespace(plans=False),
+        seeds=tuple(range(5 if told["kind"] == "learned" else 1)),
+        architecture=SimpleNamespace(plans=False, module=""),
         digest=digest_of(files),
         code="https://example.org/code",
         training={"env_steps": 1000, "seconds": 2.0, "hardware": "a laptop", "curves": curves},

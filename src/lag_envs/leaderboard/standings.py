@@ -33,8 +33,11 @@ def page_data(board: Board) -> dict[str, Any]:
         env["drives"] = drives.get(env["id"], [])
         for row in env["rows"]:
             middle, _ = shown_episodes(board.result(results[row["id"]]))
-            policy = load(board.submission(row["id"])).policies[middle][1]
-            row["agent"], row["module"] = agent(policy), policy.architecture.module
+            submission = load(board.submission(row["id"]))
+            row["agent"], row["module"] = (
+                agent(submission.policies[middle][1]),
+                submission.architecture.module,
+            )
     return data
 
 
