@@ -291,6 +291,7 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
         _train_own(run, show, tested)
         return
     from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import Logger
 
     content = run.load_checkpoint()
     model = make_model(run, make_envs(run)) if content is None else thaw(run, content)
@@ -334,6 +335,8 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             run.start_clock()
 
     watch = Watch()
+    if model.tensorboard_log is None:  # otherwise each training leaves an empty folder among temporary files
+        model.set_logger(Logger(None, []))
     if run.trained < run.steps:
         run.start_clock()
         # The learner adds its earlier steps to the number of steps it is given.
