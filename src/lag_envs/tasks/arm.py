@@ -99,6 +99,8 @@ class Reach(Task):
             "n_timesteps": 5e5, "n_epochs": 5, "gamma": 0.98, "reward_scale": 1.0, "episode_share": 1.0,
             "actor": [64, 64],
         },
+        "off_policy": {"gamma": 0.98, "n_steps": 4, "gradient_steps": 4, "learning_rate": "lin_2e-3"},
+        "td3": {"policy_kwargs": {"noise": 0.3}},
     }  # fmt: skip
     examples = Examples(
         start={"state": [-1.0, 1.0, 0.5, -1.0], "target": [0.4, 0.1]},

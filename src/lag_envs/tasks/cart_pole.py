@@ -260,7 +260,7 @@ class CartPoleContinuous(_OnTrack):
         # Large noise, kept for long, tips the pole over.
         "td3": {
             "n_timesteps": 5e4, "gradient_steps": 4,
-            "policy_kwargs": {"net_arch": [64, 64], "noise_steps": 4, "first_layer_scale": 3.0, "noise": 0.3},
+            "policy_kwargs": {"noise_steps": 4, "noise": 0.3},
         },
     }  # fmt: skip
     examples = Examples(

@@ -449,7 +449,14 @@ class Balance(_Bar):
         )
     }
     hyperparameters = {
-        "ppo": {**_SCALED, "n_timesteps": 8e5, "gamma": 0.99, "ent_coef": 0.0, "use_sde": False}
+        "ppo": {**_SCALED, "n_timesteps": 8e5, "gamma": 0.99, "ent_coef": 0.0, "use_sde": False},
+        # Large noise, kept for long, tips the bar over.
+        "td3": {
+            "n_steps": 3,
+            "gradient_steps": 2,
+            "learning_rate": "lin_2e-3",
+            "policy_kwargs": {"noise": 0.15, "noise_steps": 4},
+        },
     }
     value_iteration = ValueIteration(
         (Axis("θ [rad]", math.pi - 0.35, math.pi + 0.35, 80), Axis("θ' [rad/s]", -3.5, 3.5, 80)),
