@@ -158,6 +158,14 @@ def test_hyperparameters_are_there_for_every_environment(algo):
         assert entry["policy"] == policy
 
 
+def test_a_task_changes_parts_of_the_policys_settings(monkeypatch):
+    task = TASKS[ENV]
+    own = {"off_policy": {"policy_kwargs": {"noise_steps": 4}}, "td3": {"policy_kwargs": {"noise": 0.1}}}
+    usual = hyperparameters("td3", ENV)["policy_kwargs"]
+    monkeypatch.setattr(task, "hyperparameters", own)
+    assert hyperparameters("td3", ENV)["policy_kwargs"] == usual | {"noise_steps": 4, "noise": 0.1}
+
+
 def test_bins_are_gymnasiums():
     with gym.make(ENV) as env:
         wrapped = gym.wrappers.DiscretizeAction(env, 9)

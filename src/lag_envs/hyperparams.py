@@ -27,7 +27,12 @@ _OFF_POLICY: Mapping[str, Any] = {
     "learning_rate": 2e-3,
     "tau": 0.02,
 }
-_POLICY: Mapping[str, Any] = {"net_arch": [64, 64], "noise_steps": 8, "first_layer_scale": 3.0}
+_POLICY: Mapping[str, Any] = {
+    "net_arch": [64, 64],
+    "noise_steps": 8,
+    "first_layer_scale": 3.0,
+    "optimizer_kwargs": {"fused": True},
+}
 #: For each learner, the hyperparameters for any task.
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     # Exploration uses noise that depends on the state (gSDE) and is kept for some steps; it moves the bar,
@@ -166,7 +171,10 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
     families = ["off_policy"] * (learner in OFF_POLICY) + [learner]
     found = dict(DEFAULTS[learner])
     for family in families:
-        found |= task.hyperparameters.get(family, {})
+        own = task.hyperparameters.get(family, {})
+        if "policy_kwargs" in own:  # the policy's other settings stay
+            own = {**own, "policy_kwargs": {**found.get("policy_kwargs", {}), **own["policy_kwargs"]}}
+        found |= own
     if task.formulas.choices and learner not in OWN:
         found = {name: value for name, value in found.items() if name not in ("use_sde", "sde_sample_freq")}
         wrappers = [wrapper for wrapper in found.pop("env_wrapper", []) if DISCRETISE not in wrapper]

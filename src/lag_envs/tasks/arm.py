@@ -99,6 +99,8 @@ class Reach(Task):
             "n_timesteps": 5e5, "n_epochs": 5, "gamma": 0.98, "reward_scale": 1.0, "episode_share": 1.0,
             "actor": [64, 64],
         },
+        "off_policy": {"gamma": 0.98, "n_steps": 4, "gradient_steps": 4, "learning_rate": "lin_2e-3"},
+        "td3": {"policy_kwargs": {"noise": 0.3}},
     }  # fmt: skip
     examples = Examples(
         start={"state": [-1.0, 1.0, 0.5, -1.0], "target": [0.4, 0.1]},
@@ -115,7 +117,8 @@ class Reach(Task):
     note = (
         "Springs that pull towards the joint angles of the posture sag below them, because gravity pulls "
         "too. The computed torque compensates gravity and the links' coupling, and picks the posture that "
-        "costs less to hold."
+        "costs less to hold. Among the learners the PPO in one file is best, followed by TQC, then by SAC "
+        "and TD3."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

@@ -93,7 +93,8 @@ class Task:
         `envs.model.Model` and controllers, are those of the task without them.
     hyperparameters : mapping
         For a learner, one of `lag_envs.hyperparams.learners`, or for "off_policy", which stands for several:
-        the differences from `lag_envs.hyperparams.DEFAULTS`.
+        the differences from `lag_envs.hyperparams.DEFAULTS`. Settings in its `policy_kwargs` are changed one
+        by one.
     goal : record.Goal, optional
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
