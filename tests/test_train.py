@@ -161,9 +161,9 @@ def test_hyperparameters_are_there_for_every_environment(algo):
 def test_a_task_changes_parts_of_the_policys_settings(monkeypatch):
     task = TASKS[ENV]
     own = {"off_policy": {"policy_kwargs": {"noise_steps": 4}}, "td3": {"policy_kwargs": {"noise": 0.1}}}
-    usual = hyperparameters("td3", ENV)["policy_kwargs"]
+    usual = zoo_hyperparameters("td3", ENV)["policy_kwargs"]
     monkeypatch.setattr(task, "hyperparameters", own)
-    assert hyperparameters("td3", ENV)["policy_kwargs"] == usual | {"noise_steps": 4, "noise": 0.1}
+    assert zoo_hyperparameters("td3", ENV)["policy_kwargs"] == usual | {"noise_steps": 4, "noise": 0.1}
 
 
 def test_bins_are_gymnasiums():
