@@ -39,6 +39,7 @@ from lag_envs import __version__
 from lag_envs.evaluation.rollout import play
 from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
+from lag_envs.leaderboard.export import LOADING
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write_file
@@ -261,7 +262,7 @@ def thaw(run: Run, content: Mapping[str, Any]) -> Any:
             envs = normalise
         log = str(run.path("tensorboard"))
         model = learner(run.algo).load(
-            io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log
+            io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log, **LOADING
         )
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
@@ -386,7 +387,7 @@ def finish_training(run: Run, best: Mapping[str, Any]) -> None:
     normalise = pickle.loads(best["normalisation"])
     if normalise is not None and normalise.norm_obs:
         write_file(run.path(NORMALISATION), best["normalisation"])
-    model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu")
+    model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu", **LOADING)
     evaluate_checkpoints(run, LearnedPolicy(model, normalise, numbered(run.hyperparameters)), best["trained"])
 
 
@@ -470,7 +471,7 @@ def load_policy(folder: Path) -> Any:
     try:
         if result["algo"] in OWN:
             return import_module(OWN[result["algo"]][0]).Policy.load(folder / MODEL)
-        model = learner(result["algo"]).load(folder / MODEL, device="cpu")
+        model = learner(result["algo"]).load(folder / MODEL, device="cpu", **LOADING)
         file = folder / NORMALISATION
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None
     except Exception as error:  # whatever a damaged file leads to

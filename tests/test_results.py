@@ -362,7 +362,7 @@ def test_how_agents_act_is_what_is_committed():
     kept = json.loads(behaviour.OUTPUT.read_text())
     assert set(kept["envs"]) <= set(TASKS) and kept["episodes"] == behaviour.EPISODES
     found = behaviour.behaviour_of(ENV)
-    assert set(found) == set(kept["envs"][ENV]) == {"fast_ppo", "ppo", "switching line"}
+    assert set(found) == set(kept["envs"][ENV]) >= {"fast_ppo", "ppo", "switching line"}
     for name, measures in found.items():
         for what, values in measures.items():
             np.testing.assert_allclose(kept["envs"][ENV][name][what], values, rtol=1e-3, atol=1e-4)

@@ -35,7 +35,7 @@ SHORT = {
     "ppo": {"n_envs": 4, "n_steps": 32, "batch_size": 64, "n_epochs": 2},
     "sac": {"n_envs": 4, "learning_starts": 40, "batch_size": 16, "train_freq": 4, "gradient_steps": 1},
 }
-SHORT |= {name: SHORT["sac"] for name in ("td3", "tqc", "dqn")}
+SHORT |= {name: SHORT["sac"] for name in ("tqc", "dqn")} | {"td3": SHORT["sac"] | {"n_steps": 3}}
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +93,7 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
         assert (buffer is None) == (algo == "ppo") and model.num_timesteps == cut.trained
         if buffer is not None:
             assert model.replay_buffer.size() == buffer.size() > 0
+            assert getattr(model.replay_buffer, "n_steps", 1) == SHORT[algo].get("n_steps", 1)
             assert np.array_equal(model.replay_buffer.observations, buffer.observations)
         weights = [w.detach().numpy().copy() for w in model.policy.parameters()]
         assert before is None or not all(map(np.array_equal, before, weights))

@@ -130,13 +130,18 @@ def _name(source: Source, algo: str | None) -> str:
     return "PPO" if arrays_of(source.model) else ALGORITHMS[algo or algorithm_of(source)][1]
 
 
+#: Keyword for the `load` of Stable-Baselines3's learners: each chooses the buffer by the model's `n_steps`.
+#: The stored choice would pass for the caller's, with a warning that `n_steps` is ignored.
+LOADING: Mapping[str, Any] = {"custom_objects": {"replay_buffer_class": None}}
+
+
 def load_model(source: Source, algo: str) -> tuple[Any, Any]:
     """Return model and normalisation, or None for the latter."""
     from importlib import import_module
 
     module, name, _ = ALGORITHMS[algo]
     try:
-        model = getattr(import_module(module), name).load(source.model, device="cpu")
+        model = getattr(import_module(module), name).load(source.model, device="cpu", **LOADING)
         normalise = None if source.normalise is None else pickle.loads(source.normalise.read_bytes())
     except ImportError:
         raise

@@ -412,7 +412,7 @@ speed. It is slightly below the optimum, which may switch in the middle of a ste
 of value iteration, whose grid smears the moment of switching. PPO has found the same strategy, but usually
 crosses a little too early and too fast, which costs more than the time it saves. SAC and TQC get most of the
 way with a fifth of PPO's steps. They need returns over several steps. TD3 did not learn the task in three
-trials of at most 60,000 steps, one of them with such returns: it soon brakes fully everywhere, for good.
+short trials, one of them with such returns: it soon brakes fully everywhere, for good.
 """
 
     def check(self) -> None:
