@@ -378,7 +378,7 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
         if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
             test()
     learner.policy.save(run.path(MODEL))
-    evaluate_checkpoints(run, learner.policy, run.trained)
+    evaluate_finished(run, learner.policy, run.trained)
 
 
 def finish_training(run: Run, best: Mapping[str, Any]) -> None:
@@ -388,10 +388,10 @@ def finish_training(run: Run, best: Mapping[str, Any]) -> None:
     if normalise is not None and normalise.norm_obs:
         write_file(run.path(NORMALISATION), best["normalisation"])
     model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu", **LOADING)
-    evaluate_checkpoints(run, LearnedPolicy(model, normalise, numbered(run.hyperparameters)), best["trained"])
+    evaluate_finished(run, LearnedPolicy(model, normalise, numbered(run.hyperparameters)), best["trained"])
 
 
-def evaluate_checkpoints(run: Run, policy: Any, kept: int) -> None:
+def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
     """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))

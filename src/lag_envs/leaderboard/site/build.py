@@ -259,21 +259,8 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
-    empty: dict[str, Any] = dict.fromkeys(
-        [c.key for c in COLUMNS]
-        + [
-            "interval",
-            "license",
-            "description",
-            "hardware",
-            "id",
-            "above",
-            "alike",
-            "added",
-            "agent",
-            "module",
-        ]
-    )
+    others = "interval license description hardware id above alike added agent module".split()
+    empty: dict[str, Any] = dict.fromkeys([*(c.key for c in COLUMNS), *others])
     empty |= {"looks_like": "", "reference": False}
     row = empty | {"authors": [], "curves": [], "profile": [], "kind": "learned", "state": "verified"} | row
     row["code"] = safe_url(row.get("code"))
