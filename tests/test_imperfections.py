@@ -17,12 +17,14 @@ from lag_envs import replay
 from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
+from lag_envs.envs.imperfect.whole import WholeProgram
 from lag_envs.envs.program import Program, constants_of
 from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.leaderboard.site import driving
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_names
+from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks import TASKS, pivoted_bar
@@ -78,6 +80,56 @@ def played(env_id: str, n: int, steps: int, mode: str = "NextStep", **keywords):
 def test_all_together_single_and_vector(mode):
     seen, envs = played(ID, 3, 70, mode, duration=0.5, **ALL)
     assert len(np.unique(seen[:, :, 2])) > 50 and set(envs.unwrapped.parameters) == set(ALL["randomize"])
+
+
+#: The same without what divides steps.
+WHOLE = ALL | {"observation_delay": 0.04, "action_delay": 0.06, "lag": None}
+
+
+@pytest.mark.parametrize("mode", ["NextStep", slow("SameStep")])
+def test_what_divides_no_step_single_and_vector(mode):
+    _, envs = played(ID, 3, 70, mode, duration=0.5, **WHOLE)
+    assert type(envs.unwrapped._program) is WholeProgram
+
+
+def test_every_place_in_a_batch_has_the_same_bits():
+    lanes = [0, 3, 190, 191, 192, 249]
+    many = gym.make_vec(ID, num_envs=250, duration=0.4, **WHOLE)
+    few = gym.make_vec(ID, num_envs=len(lanes), duration=0.4, **WHOLE)
+    assert np.array_equal(many.reset(seed=5)[0][lanes], few.reset(seed=[5 + i for i in lanes])[0])
+    many.action_space.seed(0)
+    for step in range(60):
+        actions = many.action_space.sample()
+        for a, b in zip(many.step(actions)[:4], few.step(actions[lanes])[:4], strict=True):
+            assert np.array_equal(a[lanes], b)
+        if step == 30:
+            mask = np.arange(250) % 3 == 0
+            a = many.reset(options={"reset_mask": mask})[0]
+            assert np.array_equal(a[lanes], few.reset(options={"reset_mask": mask[lanes]})[0])
+
+
+def test_a_refused_step_changes_no_command_and_no_reading():
+    # Without rope the crane's mass matrix is singular.
+    spec = lag_envs.register(own_tasks.Deliver)
+    try:
+        keywords = {"observation_noise": 0.1, "observation_every": 2, "slew": 50.0}
+        envs = gym.make_vec(spec, num_envs=3, **keywords).unwrapped
+        calm, wild = [0, 0, 1, 0, 0.1, 0], [0, 0, 0, 0, 0.3, 1]
+        shown, _ = envs.reset(seed=0, options={"state": [calm, wild, calm]})
+        before = envs.get_state().rows
+        with pytest.raises(StepRefused) as refusal:
+            envs.step(np.ones((3, 2), np.float32))
+        after = envs.get_state().rows
+        for name in ("n", "c0", "c1", "h0", "h1"):
+            assert after[name][1] == before[name][1]
+        assert after["c0"][0] > 0.0 and (after["n"] == [1, 0, 1]).all()
+        assert np.array_equal(refusal.value.results[0][1], shown[1])
+        envs.reset(seed=0, options={"state": [calm] * 3})
+        envs.step(np.ones((3, 2), np.float32))
+        rows = envs.get_state().rows
+        assert all((rows[name][[0, 2]] == after[name][[0, 2]]).all() for name in rows)
+    finally:
+        gym.registry.pop(spec)
 
 
 SINGLE = [{name: value} for name, value in ALL.items()] + [

@@ -67,6 +67,11 @@ class Program:
     #: Further rows that are kept, and those of them and of the constants that are set at an episode's start.
     own: Sequence[str] = ()
     drawn: Sequence[str] = ()
+    #: Those of its own rows that a step reads, and their names once it is accepted.
+    reached: Sequence[str] = ()
+    reaching: Sequence[str] = ()
+    #: Whether a batch has a loop after the step for what the sensors show.
+    sensing = False
 
     def __init__(
         self,
@@ -99,7 +104,10 @@ class Program:
         self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying), *self.own]
         self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
         self.held = [f"held{i}" for i in range(len(self.u))]
-        self.scratch = [*self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held]
+        self.scratch = [
+            *self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held, *self.reaching,
+            *(["clock"] if self.sensing else []),
+        ]  # fmt: skip
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         width, actions, controls, targets = len(self.y), len(self.a), len(self.u), len(self.g)
@@ -185,10 +193,10 @@ class Program:
         is a number if it has one entry, else an array.
         """
         body = [
-            *self._constants_one(), *self._one.load([*self.y, *self.g, "n"]),
+            *self._constants_one(), *self._one.load([*self.y, *self.g, *self.reached, "n"]),
             *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
-            *self.control, *self.fast, *self._advance_one, *self._one.store(self.u),
+            *self._command_one, *self._controls, *self.fast, *self._advance_one, *self._one.store(self.u),
             *self._finish_one(),
         ]  # fmt: skip
         helpers = [self._stepper.engine()] if self.general else []
@@ -197,7 +205,7 @@ class Program:
     @property
     def _advance_one(self) -> list[str]:
         slow = [
-            *self._one.store(self.held, self.u),
+            *self._one.store([*self.held, *self.reaching], [*self.u, *self.reaching]),
             f"return 0.0, {SLOW}",
         ]
         if not self.general:
@@ -211,7 +219,7 @@ class Program:
     @cached_property
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step after `advance` has filled in the rows ``z``."""
-        rows = self._one.load([*self.y, *self.z, *self.g, *self.u, "n"])
+        rows = self._one.load([*self.y, *self.z, *self.g, *self.u, *self.reaching, "n"])
         return compiled_lines(
             "finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()]
         )
@@ -222,9 +230,8 @@ class Program:
         rows = [*self.y[: self.n_state], *self.g]
         body = [
             *self._constants_one(), *self._one.load(rows),
-            *next_episode("0", "1", "2"), *self._start, *self.observe,
+            *next_episode("0", "1", "2"), *self._start, *self._begin_one, *self._show_one,
             *self._one.store([*self.y, *self.g, *self.u, "n", *self.drawn]),
-            *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
         return compiled_lines("start_one", "f, obs, ids, state_given, target_given", body)
 
@@ -295,10 +302,37 @@ class Program:
             *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
             "n = n + 1.0", *(["key = ids[2]"] if self.kick else []), *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
-            *self.observe, *self._one.store([*self.y, "n"]),
-            *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
+            *self._observe_one, *self._show_one,
+            *self._one.store([*self.y, *self.reached, "n"], [*self.y, *self.reaching, "n"]),
             "return r, np.int64(over)",
         ]  # fmt: skip
+
+    # What a subclass does before the controls, and with the observation.
+
+    @property
+    def _command_one(self) -> list[str]:
+        """The lines that turn an action into the command in force."""
+        return []
+
+    @property
+    def _controls(self) -> list[str]:
+        """The lines that turn the command in force into controls."""
+        return self.control
+
+    @property
+    def _observe_one(self) -> list[str]:
+        """The lines that observe the end of a step."""
+        return self.observe
+
+    @property
+    def _begin_one(self) -> list[str]:
+        """The lines that observe a start."""
+        return self.observe
+
+    @property
+    def _show_one(self) -> list[str]:
+        """The lines that put the observation into the environment's array."""
+        return [f"obs[{j}] = {o}" for j, o in enumerate(self.o)]
 
     @property
     def _start(self) -> list[str]:
@@ -320,16 +354,17 @@ class Program:
         """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
         y, varying = self.y, [f"k_{name}" for name in self.varying]
         lane, ordinary = "for i in range(size):", self._at("ordinary")
-        inputs = self._load([*varying, *y, *self.g, "n"])
-        results = ["n", "over", "r", "ordinary", *self.o]
-        key = ["key = ids[last + first + i]"] if self.kick else []
-        controls = [*self._load(self.a), *self.control]
+        inputs = self._load([*varying, *y, *self.g, *self.reached, "n"])
+        results = ["n", "over", "r", *self.o, *(["clock"] if self.sensing else [])]
+        counted = ["clock = n"] if self.sensing else []
+        key = [self._key] if self.kick else []
+        controls = [*self._load(self.a), *self._controls]
         if self.general:
             rows = dict(zip(self._stepper.rows, self.flow, strict=True))
             # The status of a lane shows that it is to be restarted, not stepped.
             before = [
                 *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
-                *self._store(self.u),
+                *self._store([*self.u, *self.reaching]),
                 *self._store([rows[name] for name in self._stepper.given], self._stepper.given),
             ]  # fmt: skip
             after = self._load([rows[name] for name in self._stepper.results], self._stepper.results)
@@ -349,10 +384,11 @@ class Program:
             *inputs, *move,
             "again = n < 0.0", *self.outcome,
             f"plain = within{special}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
-            "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
+            "n = n + 1.0", *counted, "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
-            *self.observe, *self._store([*y, *([] if self.general else self.u), *results]),
+            *self.observe, *self._store([*y, *([] if self.general else [*self.u, *self.reaching])]),
+            *self._store([*results, "ordinary"]),
         ]  # fmt: skip
         redo = [
             f"if {ordinary} == 0.0:",
@@ -364,11 +400,11 @@ class Program:
                 "else:",
                 *indent([
                     *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
-                    "n = n + 1.0",
+                    "n = n + 1.0", *counted,
                     "if n >= k_limit:", "    over = over + 2.0",
                     *key, *self.kick, *self.move, *self.observe,
                     "if over > 0.0:", "    n = -over",
-                    *self._store([*y, "n", "over", "r", *self.o]),
+                    *self._store([*y, *results]), *([f"{ordinary} = 1.0"] if self.sensing else []),
                 ]),
             ]),
         ]  # fmt: skip
@@ -377,8 +413,8 @@ class Program:
             *indent([
                 *self._load([*varying, *self.g]),
                 *next_episode("first + i", "second + first + i", "last + first + i"),
-                "state_given, target_given = False, False", *self._start, "r = 0.0", "over = 0.0",
-                *self.observe,
+                "state_given, target_given = False, False", *self._start, *self._begin_lane,
+                "r = 0.0", "over = 0.0",
                 *self._store([*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
@@ -399,11 +435,12 @@ class Program:
                     for j, a in enumerate(self.a)
                     for line in indented(lane, [f"{self._at(a)} = action[{self._action(j)}]"])
                 ),
-                *moving,
+                *self._command_lanes, *moving,
                 *indented(lane, main),
                 *indented(lane, [f"slow += {ordinary} == 0.0", f"restarts += {ordinary} == 2.0"]),
                 "if slow > 0:", *indent(indented(lane, redo)),
                 "if restarts > 0:", *indent(indented(lane, restart)),
+                *self._sense_lanes,
                 *indented(lane, output),
                 # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
                 *(line for entry in self._shown for line in indented(lane, [entry])),
@@ -429,6 +466,35 @@ class Program:
         """The lines that put the observation into the batch's array, one row per entry."""
         return [f"obs[{j}, first + i] = {self._at(o)}" for j, o in enumerate(self.o)]
 
+    #: The key of the current environment's episode.
+    _key = "key = ids[last + first + i]"
+
+    # What a subclass does before the controls, and with the observation; see above for one environment.
+
+    @property
+    def _command_lanes(self) -> list[str]:
+        """The loops that turn actions into the commands in force."""
+        return []
+
+    @property
+    def _sense_lanes(self) -> list[str]:
+        """The loops that show what the sensors read after a step."""
+        return []
+
+    @property
+    def _begin_lane(self) -> list[str]:
+        """The lines that observe a start."""
+        return self.observe
+
+    @property
+    def _show_lane(self) -> list[str]:
+        """The lines that show the current environment, apart from a step."""
+        rows = [*(f"k_{name}" for name in self.varying), *self.y, *self.g]
+        return [
+            *self._load(rows), *self.observe,
+            *(f"obs[{j}, first + i] = {o}" for j, o in enumerate(self.o)),
+        ]  # fmt: skip
+
     def _action(self, j: int) -> str:
         """Return the place of action j of the current environment in the batch's array."""
         n = len(self.a)
@@ -440,18 +506,16 @@ class Program:
 
         Begins episodes where the mask is set. Writes their observations, and with `whole` all observations.
         """
-        varying = [f"k_{name}" for name in self.varying]
+        rows = [*(f"k_{name}" for name in self.varying), *self.y, *self.g]
         start = [
-            "if mask[first + i] or whole:",
+            "if mask[first + i]:",
             *indent([
-                *self._load([*dict.fromkeys([*varying, *self.y, *self.g, *self.u, "n", *self.drawn])]),
-                "if mask[first + i]:",
-                *indent([
-                    *next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
-                ]),
-                *self.observe, *self._store([*self.y, *self.g, *self.u, "n", *self.drawn]),
-                *(f"obs[{j}, first + i] = {o}" for j, o in enumerate(self.o)),
+                *self._load(rows),
+                *next_episode("first + i", "second + first + i", "last + first + i"),
+                *self._start, *self._begin_lane,
+                *self._store([*self.y, *self.g, *self.u, "n", *self.drawn]),
             ]),
+            "if mask[first + i] or whole:", *indent(self._show_lane),
         ]  # fmt: skip
         body = [
             *self._parameters(),

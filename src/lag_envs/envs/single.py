@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.imperfect.numbers import numbers_of
-from lag_envs.envs.imperfect.program import ImperfectProgram
+from lag_envs.envs.imperfect.divided import DividedProgram
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import SLOW
 from lag_envs.scenes.checks import StepRefused, check_number, shown
@@ -352,7 +352,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
         held = self._read(program.held)
-        if isinstance(program, ImperfectProgram):  # it has tried everything
+        if isinstance(program, DividedProgram):  # it has tried everything
             raise self._refusal(held)
         constants = numbers_of(self.task)
         constants |= {name: rows[self._row[f"k_{name}"]] for name in program.varying}

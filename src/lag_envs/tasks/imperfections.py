@@ -131,6 +131,12 @@ class Imperfections:
         return self.observation_delay % 1.0 > 0.0
 
     @property
+    def whole(self) -> bool:
+        """Whether commands change, and observations are taken, at the ends of control steps only."""
+        shortest, longest = self.action_delay
+        return not (self.lag or self.within or shortest < longest or longest % 1.0)
+
+    @property
     def structure(self) -> tuple:
         """What determines the code; everything else is its input."""
         return (
@@ -140,6 +146,7 @@ class Imperfections:
             self.observation_every > 1,
             tuple(x > 0.0 for x in self.action_noise),
             self.commands,
+            self.whole,
             self.action_delay[0] < self.action_delay[1],
             tuple(map(math.isfinite, self.slew)),
             bool(self.lag),

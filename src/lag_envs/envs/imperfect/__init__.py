@@ -1,11 +1,13 @@
 """Programs of environments with hidden parameters, imperfect sensors or actuators.
 
 docs/usage.md explains the keywords; `lag_envs.tasks.imperfections` checks them. Drawn parameters are rows of
-a batch, like parameters that differ within any batch (`drawn`). With other imperfections (`program`) one
-function takes a control step on the rows of one environment. The single environment calls it on its own rows,
-a batch on those of each environment in turn, so both have the same bits. Within a step the command in force
-may change, and the state that a late sensor shows may lie inside the step: it is divided at these times, and
-nowhere else.
+a batch, like parameters that differ within any batch (`drawn`). Noise, pushes, slew and delays of whole
+control steps change the command before a step and what is shown after it, in loops of their own (`whole`).
+
+With other imperfections (`divided`) one function takes a control step on the rows of one environment. The
+single environment calls it on its own rows, a batch on those of each environment in turn, so both have the
+same bits. Within a step the command in force may change, and the state that a late sensor shows may lie
+inside the step: it is divided at these times, and nowhere else.
 
 Draws come from the same generator as starts and kicks, with a key for each purpose, derived from that of the
 episode.

@@ -47,7 +47,8 @@ class Actuators:
         self._options, self._constants = options, constants
         self.reached = [f"c{i}" for i in range(len(a))] if options.slew else []
         self._sent = {f"sent{i}": name for i, name in enumerate(a)}
-        self.ring = Ring([*self._sent, "at"], options.commands if options.commands > 1 else 0)
+        late = [] if options.whole else ["at"]
+        self.ring = Ring([*self._sent, *late], options.commands if options.commands > 1 else 0)
 
         def asked(xp: Any, *values: Any) -> Sequence:
             return formulas.wanted(xp, list(values))
@@ -92,11 +93,15 @@ class Actuators:
         """Return the lines that begin an episode with the command at rest."""
         return [
             *self.at_rest,
-            *rows.fill(self.ring, self._sent | {"at": "0.0"}),
+            *rows.fill(self.ring, self._sent | ({} if self._options.whole else {"at": "0.0"})),
         ]
 
+    def delay(self, rows: RowsWithRings) -> list[str]:
+        """Return the lines that replace a command by the one in force, if all are late by whole steps."""
+        return rows.turn(self.ring, self._sent, self._sent) if self.ring.slots else []
+
     def send(self, rows: RowsWithRings) -> list[str]:
-        """Return the lines that send a command, if it is delayed."""
+        """Return the lines that send a command, if it is delayed by parts of a step."""
         if not self.ring.slots:
             return []
         low, high = self._constants["late_low"], self._constants["late_high"]

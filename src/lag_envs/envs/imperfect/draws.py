@@ -56,8 +56,8 @@ def noise(
         if pair:
             lines += [
                 f"{x} = uniform(key_{purpose}, np.uint64(n) * np.uint64({per_step}), np.uint64({j}))"
-                for x, j in zip(("first", "second"), (i, i + 1), strict=True)
+                for x, j in zip(("draw0", "draw1"), (i, i + 1), strict=True)
             ]
-            lines += recorded_lines(two, ["first", "second"], ["normal0", "normal1"], trace)
+            lines += recorded_lines(two, ["draw0", "draw1"], ["normal0", "normal1"], trace)
             lines += [f"{values[j]} += {constants[names[j]]} * normal{j - i}" for j in pair]
     return lines

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lag_envs.envs.imperfect.divided import DividedProgram
 from lag_envs.envs.imperfect.drawn import DrawnProgram
-from lag_envs.envs.imperfect.program import ImperfectProgram
+from lag_envs.envs.imperfect.whole import WholeProgram
 from lag_envs.envs.program import Program, program_for
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import Imperfections
@@ -24,7 +25,8 @@ def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
         key = (*key, task.drawn.inner.formulas.key, *task.drawn.made)
     if key not in _programs:
         only_drawn = Imperfections(drawn=task.imperfections.drawn) == task.imperfections
-        _programs[key] = (DrawnProgram if only_drawn else ImperfectProgram)(task, absent, varying)
+        undivided = WholeProgram if task.imperfections.whole else DividedProgram
+        _programs[key] = (DrawnProgram if only_drawn else undivided)(task, absent, varying)
     return _programs[key]
 
 

@@ -1,4 +1,4 @@
-"""Rows of one environment, alone or in a batch: row r lies at ``f[base + r * stride]``."""
+"""Rows of which some are stored several times."""
 
 from __future__ import annotations
 
@@ -21,21 +21,26 @@ class Ring(NamedTuple):
 
 
 class RowsWithRings(Rows):
-    """Rows of one environment, some of them in rings.
+    """Rows of which some are in rings; the arguments are those of `Rows`."""
 
-    Parameters
-    ----------
-    kept : sequence of str
-        All rows, in their order.
-    """
-
-    def __init__(self, kept: Sequence[str]) -> None:
-        super().__init__(kept, "f", "base", "stride")
+    def whole(self, number: object) -> str:
+        """Return a whole number as printed, of the type of the indices."""
+        return f"np.uint64({number})" if isinstance(self._stride, int) else f"np.int64({number})"
 
     def in_slot(self, ring: Ring, row: str) -> str:
         """Return the place of a row of a ring, in the slot numbered ``slot``."""
-        first = self.names.index(f"{row}_0")
-        return f"f[base + ({first} + slot * {len(ring.rows)}) * stride]"
+        first, n = self.whole(self.names.index(f"{row}_0")), self.whole(len(ring.rows))
+        return f"{self._array}[{self._first} + ({first} + slot * {n}) * {self.whole(self._stride)}]"
+
+    def turn(self, ring: Ring, values: Mapping[str, str], results: Mapping[str, str]) -> list[str]:
+        """Return the lines of step ``n`` that write values and read the oldest ones, as results by row."""
+        slots = self.whole(ring.slots)
+        return [
+            f"slot = {self.whole('n')} % {slots}",
+            *self.put(ring, values),
+            f"slot = (slot + {self.whole(1)}) % {slots}",
+            *(f"{result} = {self.in_slot(ring, row)}" for row, result in results.items()),
+        ]
 
     def put(self, ring: Ring, values: Mapping[str, str]) -> list[str]:
         """Return the lines that write values into a slot."""
@@ -45,4 +50,5 @@ class RowsWithRings(Rows):
         """Return the lines that write values into all slots."""
         if not ring.slots:
             return []
-        return [f"for slot in range({ring.slots}):", *("    " + line for line in self.put(ring, values))]
+        slots = f"range({self.whole(ring.slots)})"
+        return [f"for slot in {slots}:", *("    " + line for line in self.put(ring, values))]

@@ -40,7 +40,10 @@ class Sensors:
         constants: Mapping[str, Any],
         trace: type[Trace],
     ) -> None:
-        self._options, self._o, self._observe, self._every = options, observed, observe, constants["every"]
+        self._options, self._o, self._observe = options, observed, observe
+        every = constants["every"]
+        #: Whether a reading is due after step ``n``; empty if one always is.
+        self.due = f"np.floor(n / {every}) * {every} == n" if options.observation_every > 1 else ""
         self.shown = [f"h{i}" for i in range(len(observed))]
         self._seen = {f"seen{i}": o for i, o in enumerate(observed)}
         self.ring = Ring([*self._seen], options.readings)
@@ -60,19 +63,14 @@ class Sensors:
 
     def read(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that show the observation at the end of a step."""
-        lines, found = [*self._observe], self._options
-        if found.readings:
-            values = {row: f"m{i}" for i, row in enumerate(self._seen)} if found.within else self._seen
-            lines += [
-                f"slot = np.int64(n) % {found.readings}",
-                *rows.put(self.ring, values),
-                f"slot = (slot + 1) % {found.readings}",
-                *(f"{o} = {rows.in_slot(self.ring, row)}" for row, o in self._seen.items()),
-            ]
         show = [*self.sense, *self._show(rows)]
-        if found.observation_every > 1:
-            return [*lines, f"if np.int64(n) % np.int64({self._every}) == 0:", *indent(show)]
-        return [*lines, *show]
+        shown = [f"if {self.due}:", *indent(show)] if self.due else show
+        return [*self._observe, *self.delay(rows), *shown]
+
+    def delay(self, rows: RowsWithRings) -> list[str]:
+        """Return the lines that replace the observation by the one to be shown now, if sensors are late."""
+        taken = {row: f"m{i}" for i, row in enumerate(self._seen)} if self._options.within else self._seen
+        return rows.turn(self.ring, taken, self._seen) if self.ring.slots else []
 
     def _show(self, rows: RowsWithRings) -> list[str]:
         return [f"{rows.at(h)} = {o}" for h, o in zip(self.shown, self._o, strict=True)]

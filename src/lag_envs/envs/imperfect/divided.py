@@ -1,4 +1,4 @@
-"""Steps with imperfect sensors or actuators, one environment at a time."""
+"""Steps that imperfect sensors or actuators divide, one environment at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lag_envs.stepping.lag import lagged_stepper
 from lag_envs.tasks.base import Task
 
 
-class ImperfectProgram(DrawnProgram):
+class DividedProgram(DrawnProgram):
     """The compiled functions of a task with imperfections; the arguments are those of `Program`.
 
     The further rows that it keeps are those of `Sensors` and `Actuators`.
@@ -29,12 +29,12 @@ class ImperfectProgram(DrawnProgram):
     def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
         super().__init__(task, absent, varying)
         self.scratch = [*self.a, *self.o, *self.held]
-        self._where = RowsWithRings(self.kept)
+        self._where = RowsWithRings(self.kept, "f", "base", "stride")
 
     @property
     def _printed(self) -> list[str]:
-        names = ("late_low", "late_high", "shown_at", "every", "push_chance")
-        inside = (self._actuators.perturb, self._sensors.sense, self._pushes)
+        names = ("late_low", "late_high", "shown_at")
+        inside = (self._actuators.perturb, self._sensors.sense, [self._sensors.due])
         commands = (self._actuators.at_rest, self._actuators.command)
         more = (*inside, *commands, [f"k_{name}" for name in names], self._motion.constants)
         return [*super()._printed, *(line for part in more for line in part)]
@@ -44,7 +44,9 @@ class ImperfectProgram(DrawnProgram):
         found, scene, trace = self.options, self._source.scene, formulas.trace
         self._sensors = Sensors(found, self.o, self.observe, self._bounded, constants, trace)
         self._actuators = Actuators(found, formulas, self.a, self.y, self.u, self.clip, constants)
-        self._pushes = pushes(found, constants)
+        pushed, lines = pushes(found, self.moved, constants)
+        self.moved, self.kick = pushed, [*self.kick, *lines]
+        self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
         self._lagged: Any = None
         self._motion: Held | Lagged
         if found.lag:
@@ -83,7 +85,7 @@ class ImperfectProgram(DrawnProgram):
             *(f"a{i} = work[{i}]" for i in range(n_act)),
             *actuators.perturb, *actuators.send(rows), *self._through,
             *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
-            "n = n + 1.0", *self.kick, *self.move, *self._pushes,
+            "n = n + 1.0", *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
             *sensors.read(rows),
             *(f"work[{n_act + i}] = {rows.at(h)}" for i, h in enumerate(sensors.shown)),

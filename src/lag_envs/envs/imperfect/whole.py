@@ -1,0 +1,134 @@
+"""Steps whose commands change, and whose sensors read, at their ends only: a batch is stepped side by side."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lag_envs.envs.imperfect.actuators import Actuators
+from lag_envs.envs.imperfect.drawn import DrawnProgram
+from lag_envs.envs.imperfect.pushes import pushes
+from lag_envs.envs.imperfect.rows import RowsWithRings
+from lag_envs.envs.imperfect.sensors import Sensors
+from lag_envs.envs.lines import indent, indented
+from lag_envs.stepping.compiling import BLOCK
+from lag_envs.tasks.base import Task
+
+
+class WholeProgram(DrawnProgram):
+    """The compiled functions of a task with imperfections that divide no step; see `Imperfections.whole`.
+
+    The further rows that it keeps are those of `Sensors` and `Actuators`.
+    """
+
+    sensing = True
+
+    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
+        super().__init__(task, absent, varying)
+        self._single = RowsWithRings(self.kept, "f", "np.uint64(0)", 1)
+        self._lane = RowsWithRings(self.kept, "f", "base + i", BLOCK)
+
+    @property
+    def _printed(self) -> list[str]:
+        parts = (self._actuators.perturb, self._actuators.at_rest, self._controls, self._sensors.sense)
+        return [*super()._printed, *(line for part in parts for line in part), self._sensors.due]
+
+    def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
+        super()._record(formulas, constants)
+        found = self.options
+        sensors = Sensors(found, self.o, self.observe, self._bounded, constants, formulas.trace)
+        actuators = Actuators(found, formulas, self.a, self.y, self.u, self.clip, constants)
+        self._sensors, self._actuators = sensors, actuators
+        self.reached = actuators.reached
+        self.reaching = [f"next_{c}" for c in self.reached]
+        self.own = [*self.own, *self.reached, *sensors.shown, *actuators.ring.names, *sensors.ring.names]
+        pushed, lines = pushes(found, self.moved, constants)
+        self.moved, self.kick = pushed, [*self.kick, *lines]
+        self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
+
+    def _bound_observations(self) -> None:
+        """Leave observations unbounded: what the sensors show is bounded later."""
+
+    @property
+    def _controls(self) -> list[str]:
+        reached = zip(self.reaching, self.reached, strict=True)
+        command = ["h = k_dt", *self._actuators.command, *(f"{after} = {c}" for after, c in reached)]
+        return [*self.clip, *command]
+
+    # --- one environment ------------------------------------------------------------------------------------
+
+    @property
+    def _command_one(self) -> list[str]:
+        return ["key = ids[2]", *self._actuators.perturb, *self._actuators.delay(self._single)]
+
+    @property
+    def _observe_one(self) -> list[str]:
+        return ["key = ids[2]", *self._sensors.read(self._single)]
+
+    @property
+    def _begin_one(self) -> list[str]:
+        return [
+            *self._actuators.begin(self._single), *self._single.store(self.reached),
+            *self._sensors.begin(self._single),
+        ]  # fmt: skip
+
+    @property
+    def _show_one(self) -> list[str]:
+        return [f"obs[{j}] = {self._single.at(h)}" for j, h in enumerate(self._sensors.shown)]
+
+    # --- a batch --------------------------------------------------------------------------------------------
+
+    @property
+    def _command_lanes(self) -> list[str]:
+        lane, delay = "for i in range(size):", self._actuators.delay(self._lane)
+        perturb = [self._key, *self._load([*self.a, "n"]), *self._actuators.perturb, *self._store(self.a)]
+        return [
+            *(indented(lane, perturb) if delay or self.options.action_noise else []),
+            # Not side by side: each environment has its own slot. One that is to be restarted has none.
+            *(
+                indented(lane, [
+                    *self._load(["n"]),
+                    "if n >= 0.0:", *indent([*self._load(self.a), *delay, *self._store(self.a)]),
+                ])
+                if delay
+                else []
+            ),
+        ]  # fmt: skip
+
+    @property
+    def _sense_lanes(self) -> list[str]:
+        lane, sensors, stepped = "for i in range(size):", self._sensors, f"{self._at('ordinary')} == 1.0"
+        delay, clock = sensors.delay(self._lane), self._load(["clock"], ["n"])
+        shown = f"stepped & ({sensors.due})" if sensors.due else "stepped"
+        sense = [
+            f"stepped = {stepped}", self._key, *clock,
+            *self._load([*self.o, *self.reached, *self.reaching, *sensors.shown]), *sensors.sense,
+            f"shown = {shown}",
+            *(f"{h} = select(shown, {o}, {h})" for h, o in zip(sensors.shown, self.o, strict=True)),
+            *(f"{c} = select(stepped, next_{c}, {c})" for c in self.reached),
+            *self._store([*sensors.shown, *self.reached]),
+        ]  # fmt: skip
+        return [
+            *(
+                indented(lane, [
+                    f"if {stepped}:", *indent([*clock, *self._load(self.o), *delay, *self._store(self.o)]),
+                ])
+                if delay
+                else []
+            ),
+            *indented(lane, sense),
+        ]  # fmt: skip
+
+    @property
+    def _begin_lane(self) -> list[str]:
+        return [
+            *self._actuators.begin(self._lane), *self._lane.store(self.reached),
+            *self._sensors.begin(self._lane),
+        ]  # fmt: skip
+
+    @property
+    def _show_lane(self) -> list[str]:
+        return self._shown
+
+    @property
+    def _shown(self) -> list[str]:
+        return [f"obs[{j}, first + i] = {self._at(h)}" for j, h in enumerate(self._sensors.shown)]
