@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.divided import DividedProgram
+from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import SLOW
 from lag_envs.scenes.checks import StepRefused, check_number, shown

@@ -28,11 +28,12 @@ def pushes(
     if not found:
         return after, []
     draws = (f"uniform(key_push, np.uint64(n), np.uint64({1 + j}))" for j in range(len(found)))
+    sizes = (f"{constants[f'push{i}']} * (2.0 * {draw} - 1.0)" for i, draw in zip(found, draws, strict=True))
     return after, [
         f"key_push = {purpose_key('push')}",
         f"push = uniform(key_push, np.uint64(n), np.uint64(0)) < {constants['push_chance']}",
         *(
-            f"pushed{i} = select(push, {state[i]} + {constants[f'push{i}']} * (2.0 * {draw} - 1.0), {state[i]})"
-            for i, draw in zip(found, draws, strict=True)
+            f"pushed{i} = select(push, {state[i]} + {size}, {state[i]})"
+            for i, size in zip(found, sizes, strict=True)
         ),
     ]

@@ -1,4 +1,4 @@
-"""Steps whose commands change, and whose sensors read, at their ends only: a batch is stepped side by side."""
+"""Steps at whose ends alone commands change and sensors read: a batch is stepped side by side."""
 
 from __future__ import annotations
 
