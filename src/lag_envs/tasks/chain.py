@@ -250,6 +250,10 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in t
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
     quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
+    # A plan that goes far beyond the catch drifts where this support can no longer correct it.
+    controllers = SwingUp.controllers | {
+        "iLQR": Controller("lag_envs.controllers.chain:replan", {"beyond": 1.1}, plans=True)
+    }
     hyperparameters = {
         "fast_ppo": {
             "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
