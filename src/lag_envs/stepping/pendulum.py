@@ -450,6 +450,10 @@ def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp,
         slopes[1, column] = speed / h
 
 
+def _no_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
+    """Carry no derivatives: what a plain step compiles in place of `_slow_slopes`."""
+
+
 def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # type: ignore[no-untyped-def]
     """Return how a step is divided: until when, into how many substeps, and how many along the slow manifold.
 
@@ -526,7 +530,7 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
     """
     holds, series = _compile_parts(present, order)
     divided = compile_python("divided", _divided, *_divided_parts(order))
-    plan, slow = _compile_plan(tolerance), _compile_slow_motion()
+    plan, slow = _compile_plan(tolerance), _compile_slow_motion(_no_slopes)
     return compile_python("flow", _flow, holds, series, plan, divided, slow, order=order)
 
 
@@ -557,8 +561,8 @@ def _compile_plan(tolerance: float) -> Callable:
 
 
 @cache
-def _compile_slow_motion() -> Callable:
-    return compile_python("slow_motion", _slow_motion, compile_python("slow_slopes", _slow_slopes))
+def _compile_slow_motion(slopes: Callable) -> Callable:
+    return compile_python("slow_motion", _slow_motion, compile_python("slow_slopes", slopes))
 
 
 @cache
@@ -676,7 +680,7 @@ def compile_tangent(
         compile_function("local", "\n    ".join(body) + "\n"),
         compile_python("carry", _carry, ROWS=rows),
         _compile_plan(tolerance),
-        _compile_slow_motion(),
+        _compile_slow_motion(_slow_slopes),
         *_divided_parts(order),
         order=order,
         ROWS=rows,

@@ -21,13 +21,13 @@ class Rows:
     """
 
     def __init__(self, names: Sequence[str], array: str, first: str, stride: int | str) -> None:
-        self.names, self._array, self._first, self._stride = list(names), array, first, stride
+        self.names, self.array, self.first, self.stride = list(names), array, first, stride
 
     def at(self, row: str) -> str:
         """Return the place of a row."""
-        r, stride = self.names.index(row), self._stride
+        r, stride = self.names.index(row), self.stride
         beyond = f"np.uint64({r * stride})" if isinstance(stride, int) else f"{r} * {stride}"
-        return f"{self._array}[{self._first} + {beyond}]"
+        return f"{self.array}[{self.first} + {beyond}]"
 
     def load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
         """Return the line that reads rows into variables, by default of their names."""
@@ -39,4 +39,4 @@ class Rows:
 
     def _places(self, rows: Sequence[str]) -> str:
         numbers = "".join(f"{self.names.index(row)}, " for row in rows)
-        return f"{self._array}, {self._first}, {self._stride}, ({numbers})"
+        return f"{self.array}, {self.first}, {self.stride}, ({numbers})"

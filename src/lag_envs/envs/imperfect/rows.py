@@ -25,12 +25,12 @@ class RowsWithRings(Rows):
 
     def whole(self, number: object) -> str:
         """Return a whole number as printed, of the type of the indices."""
-        return f"np.uint64({number})" if isinstance(self._stride, int) else f"np.int64({number})"
+        return f"np.uint64({number})" if isinstance(self.stride, int) else f"np.int64({number})"
 
     def in_slot(self, ring: Ring, row: str) -> str:
         """Return the place of a row of a ring, in the slot numbered ``slot``."""
         first, n = self.whole(self.names.index(f"{row}_0")), self.whole(len(ring.rows))
-        return f"{self._array}[{self._first} + ({first} + slot * {n}) * {self.whole(self._stride)}]"
+        return f"{self.array}[{self.first} + ({first} + slot * {n}) * {self.whole(self.stride)}]"
 
     def turn(self, ring: Ring, values: Mapping[str, str], results: Mapping[str, str]) -> list[str]:
         """Return the lines of step ``n`` that write values and read the oldest ones, as results by row."""
