@@ -175,26 +175,8 @@ class Expr:
         return -self + other
 
     def __mul__(self, other: Any) -> Expr:
-        first, second = self, Expr.of(other)
-        if len(first.terms) * len(second.terms) > LARGEST_PRODUCT:
-            first, second = (_closed(e) for e in (first, second))
-        result: dict[Monomial, int | Fraction] = {}
-        rest: list[Expr] = []
-        for m, c in first.terms.items():
-            for n, d in second.terms.items():
-                monomial, more = _product(m, n)
-                if more is not None:
-                    rest.append(Expr({monomial: c * d}) * more)
-                    continue
-                total = result.get(monomial, 0) + c * d
-                if total:
-                    result[monomial] = total
-                else:
-                    del result[monomial]
-        value = Expr(result)
-        for more in rest:
-            value = value + more
-        return value
+        second = Expr.of(other)
+        return self**2 if self._keeps(2) and self.same(second) else _expanded(self, second)
 
     __rmul__ = __mul__
 
@@ -218,6 +200,8 @@ class Expr:
                 "powers: write xp.exp(p * xp.log(x)) for others"
             )
         n = int(exponent)
+        if self._keeps(n):
+            return Expr({((Atom("function", "sum", self), n),): 1})
         base = self if n >= 0 else self.reciprocal()
         result = Expr.of(1)
         for bit in bin(abs(n))[2:]:
@@ -228,6 +212,22 @@ class Expr:
 
     def __rpow__(self, base: Any) -> NoReturn:
         raise FormulaError(f"{base!r} is raised to a recorded power; write xp.exp(x * {base!r}'s logarithm)")
+
+    def _keeps(self, exponent: int) -> bool:
+        """Return whether a power of this is kept as it is.
+
+        (x - c)⁴ expanded would be a small difference of large numbers where x is near c. A square is expanded
+        if terms of it may meet others: in a kinetic energy, and by cos² + sin² = 1.
+        """
+        if exponent < 2 or len(self.terms) < 2:
+            return False
+        moving = [a for a in self.atoms() if any(s.kind != "parameter" for s in Expr.of(a).symbols())]
+        if exponent > 2:
+            return bool(moving)
+        meets = ("sin", "cos")
+        return bool(moving) and not any(
+            a.function in meets or s.kind == "velocity" for a in moving for s in Expr.of(a).symbols()
+        )
 
     def reciprocal(self) -> Expr:
         """Return one over the expression."""
@@ -330,6 +330,29 @@ def _product(first: Monomial, second: Monomial) -> tuple[Monomial, Expr | None]:
     return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text)), more
 
 
+def _expanded(first: Expr, second: Expr) -> Expr:
+    """Return the product of two expressions, term by term."""
+    if len(first.terms) * len(second.terms) > LARGEST_PRODUCT:
+        first, second = (_closed(e) for e in (first, second))
+    result: dict[Monomial, int | Fraction] = {}
+    rest: list[Expr] = []
+    for m, c in first.terms.items():
+        for n, d in second.terms.items():
+            monomial, more = _product(m, n)
+            if more is not None:
+                rest.append(Expr({monomial: c * d}) * more)
+                continue
+            total = result.get(monomial, 0) + c * d
+            if total:
+                result[monomial] = total
+            else:
+                del result[monomial]
+    value = Expr(result)
+    for more in rest:
+        value = value + more
+    return value
+
+
 def _closed(expr: Expr) -> Expr:
     """Return a long sum without velocities as one atom, so that products with it stay short."""
     if len(expr.terms) <= 8 or any(s.kind == "velocity" for s in expr.symbols()):
@@ -391,7 +414,7 @@ def _root(square: Expr) -> Expr | None:
         root = root - term if opposite else root + term
     # An even power is kept apart from a square that comes by chance: only the whole decides.
     odd = any(n % 2 for monomial in root.terms for _, n in monomial) or len(root.terms) > 1
-    return root if odd and (root * root).same(square) else None
+    return root if odd and _expanded(root, root).same(square) else None
 
 
 def _leads_negative(expr: Expr) -> bool:
