@@ -70,10 +70,15 @@ class Atom:
         return Atom, (self.kind, self.name, self.argument)
 
 
-def _exact(value: float) -> int | Fraction:
-    number = float(value)
+def _exact(value: Any) -> int | Fraction:
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
     if not math.isfinite(number):
         raise FormulaError(f"a formula uses the number {number}")
+    if isinstance(value, int | Fraction):
+        return value
     return int(number) if number.is_integer() else Fraction(number)
 
 
@@ -97,7 +102,7 @@ class Expr:
             raise FormulaError(
                 f"a formula combines a recorded number with {value!r}; it must be a real number"
             )
-        exact = value if isinstance(value, int | Fraction) else _exact(float(value))
+        exact = _exact(value)
         return Expr({(): exact} if exact else {})
 
     # --- queries --------------------------------------------------------------------------------------------
