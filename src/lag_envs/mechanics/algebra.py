@@ -495,8 +495,8 @@ def _slope(atom: Atom) -> Expr:
         return Fraction(1, 2) * Expr.of(atom).reciprocal()
     if atom.function == "atan":
         return (1 + x * x).reciprocal()
-    if atom.function == "tanh":
-        return 1 - Expr.of(atom) * Expr.of(atom)
+    if atom.function == "tanh":  # kept whole: its series has all digits also where tanh is nearly 1
+        return Expr.of(Atom("function", "sum", 1 - Expr.of(atom) * Expr.of(atom)))
     return Expr.of(1)  # a sum
 
 
