@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.mechanics.evaluation import DualArray, DualArrayFunctions, MotionPoint
+from lag_envs.mechanics.evaluation import DualArray, DualArrayFunctions, MotionPoint, exactly
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes.checks import (
     StepRefused,
@@ -137,7 +137,9 @@ def _momentum_bounds(
         DualArray(x, unit[free.index(e.coordinate)]) if e.kind == "place" and e.coordinate in free else x
         for e, x in zip(layout_of(scene).state, end, strict=True)
     ]
-    point = MotionPoint(scene.mechanics, scene._symbols(), numbers, list(control), DualArrayFunctions)
+    point = MotionPoint(
+        scene.mechanics, exactly(parameter_values(scene)), numbers, list(control), DualArrayFunctions
+    )
     slopes = [k.slope if isinstance(k, DualArray) else np.zeros(len(free)) for k in point.shift]
     return {
         ("momentum", name): v + float(np.abs(slope) @ places)
