@@ -456,6 +456,33 @@ def test_differences_of_parameters_keep_their_digits():
     np.testing.assert_allclose(scene.simulate(state, [control], 1e-4)[-1], exact, rtol=1e-13)
 
 
+class Elsewhere(Scene):
+    """A slider on a turning beam, held by springs, wells and a bump about one place."""
+
+    where: float = parameter(0.0, "m")
+    coordinates = {"x": "m", "psi": "rad"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2 + 0.5 * ((q.x - self.where) ** 2 + 0.01) * v.psi**2
+
+    def potential(self, q, xp):
+        out = q.x - self.where
+        springs = 20 * out**3 + 100 * out**8 + (out**2 - 0.25) ** 2
+        return springs + out * out * xp.cos(q.psi) + xp.exp(-50 * out**2) + xp.sqrt(0.01 + out**2)
+
+
+def test_powers_about_a_far_place_keep_their_digits():
+    """Expanded, (x - c)⁸ would be a small difference of large numbers."""
+    near, far = Elsewhere(), Elsewhere(where=1024.0)
+    here, there = np.array([0.375, 0.5, 0.25, -2.0]), np.array([1024.375, 0.5, 0.25, -2.0])
+    np.testing.assert_allclose(far.mass_matrix(there), near.mass_matrix(here), rtol=1e-15)
+    for name, found in far.acceleration(there).items():
+        assert found == pytest.approx(near.acceleration(here)[name], rel=1e-12)
+    assert far.step_bound(there).substeps == near.step_bound(here).substeps
+    after = far.simulate(there, 1, 0.02)[1] - [1024.0, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(after, near.simulate(here, 1, 0.02)[1], rtol=1e-12)
+
+
 def test_what_rests_leaves_no_code():
     for scene in (PivotedBar(), *(Incline(control=mode) for mode in Incline.modes), CylinderInCylinder()):
         for name in ("rise", "lift", "slip", "gap"):

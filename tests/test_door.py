@@ -108,6 +108,11 @@ def float_of_a_number():
     return potential(lambda self, q, xp: float(q.x) ** 2)
 
 
+@mistake("potential", "the number inf")
+def number_beyond_floats():
+    return potential(lambda self, q, xp: 10**400 * q.x)
+
+
 @mistake("potential", "int()", "smooth")
 def int_of_a_number():
     return potential(lambda self, q, xp: int(q.x) * q.x)
@@ -327,6 +332,11 @@ def chance():
 
 
 # --- invalid energies --------------------------------------------------------------------------------------
+
+
+@mistake("kinetic", "degree 4", "two at most")
+def fourth_power_of_a_sum():
+    return kinetic(lambda self, q, v, xp: v.x**2 + v.y**2 + (v.x - v.y) ** 4)
 
 
 @mistake("kinetic", "degree 3", "two at most")

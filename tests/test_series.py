@@ -16,7 +16,7 @@ from typing import NamedTuple
 import flint
 import numpy as np
 import pytest
-from contract_scenes import Trolley
+from contract_scenes import ElasticPendulum, Trolley
 from covering import every, slow
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System
@@ -577,10 +577,48 @@ def test_tanh_that_rounds_to_one_keeps_its_digits(x):
     assert scene.jacobian([x, rate, 0.0, 0.0], [], dt)[0][3, 0] == pytest.approx(wanted, rel=1e-12)
 
 
+class Ledge(Scene):
+    """A ledge, steep at 0 and nearly level elsewhere."""
+
+    height: float = parameter(1000.0, "J")
+    coordinates = {"x": "m"}
+
+    def kinetic(self, q, v, xp):
+        return v.x**2 / 2
+
+    def potential(self, q, xp):
+        return self.height * xp.tanh(q.x)
+
+
+@pytest.mark.parametrize("x", [9.0, -16.0, 25.0])
+def test_force_of_a_tanh_keeps_its_digits(x):
+    """h - h tanh² would have none left."""
+    force, dt = -1000.0 / math.cosh(x) ** 2, 0.02
+    after = Ledge().simulate([x, 0.0], 1, dt)[1]
+    assert after[1] == pytest.approx(force * dt, rel=1e-9)  # it hardly moves
+    slope = Ledge().jacobian([x, 0.0], [], dt, parameters=["height"])[2]
+    assert slope[1, 0] == pytest.approx(force * dt / 1000.0, rel=1e-9)
+
+
 def test_refusal_of_a_scene_brings_what_went_before():
     with pytest.raises(StepRefused, match="step 2 of 4") as refusal:
         Polar().simulate([0.5, -10.0, 0.0, 0.0], 4, 0.02)
     assert refusal.value.trajectory.shape == (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("scene", "state", "most"),
+    [
+        (Trolley(), [0.1, 0.2, 0.7, 1.0, -0.4, 2.0], 1.01),
+        (ElasticPendulum(), [0.0, 0.5, 0.1, -0.3, 0.2], 1.0),  # v and w differ by a constant
+    ],
+)
+def test_bound_of_what_carries_a_held_rate(scene, state, most):
+    bound = scene.step_bound(state, [1.0, 0.5, 0.1][: len(scene.control_names)], 0.02)
+    assert bound.substeps == 1
+    for name in scene.coordinates:
+        velocity = bound.bounds[name] * (bound.order + 2) / 0.02
+        assert velocity * (1.0 - 1e-12) < bound.bounds[f"w_{name}"] < velocity * (most + 1e-12)
 
 
 def test_threads_share_a_scene_and_run_side_by_side():

@@ -3,9 +3,10 @@
 Energies are run once on `Expr` objects. An `Expr` is kept expanded, as a map from monomials to rational
 coefficients, so that equal terms are merged and terms that cancel leave nothing behind: deriving an equation
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
-an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Besides the rules
-of sums and products there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that agree in
-everything else (`apply_identities`).
+an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers of moving
+sums are not expanded, except squares whose terms may meet others. Besides the rules of sums and products
+there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that agree in everything else
+(`apply_identities`).
 
 Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
 same bits in every process.
@@ -70,10 +71,15 @@ class Atom:
         return Atom, (self.kind, self.name, self.argument)
 
 
-def _exact(value: float) -> int | Fraction:
-    number = float(value)
+def _exact(value: Any) -> int | Fraction:
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
     if not math.isfinite(number):
         raise FormulaError(f"a formula uses the number {number}")
+    if isinstance(value, int | Fraction):
+        return value
     return int(number) if number.is_integer() else Fraction(number)
 
 
@@ -97,7 +103,7 @@ class Expr:
             raise FormulaError(
                 f"a formula combines a recorded number with {value!r}; it must be a real number"
             )
-        exact = value if isinstance(value, int | Fraction) else _exact(float(value))
+        exact = _exact(value)
         return Expr({(): exact} if exact else {})
 
     # --- queries --------------------------------------------------------------------------------------------
@@ -175,26 +181,8 @@ class Expr:
         return -self + other
 
     def __mul__(self, other: Any) -> Expr:
-        first, second = self, Expr.of(other)
-        if len(first.terms) * len(second.terms) > LARGEST_PRODUCT:
-            first, second = (_closed(e) for e in (first, second))
-        result: dict[Monomial, int | Fraction] = {}
-        rest: list[Expr] = []
-        for m, c in first.terms.items():
-            for n, d in second.terms.items():
-                monomial, more = _product(m, n)
-                if more is not None:
-                    rest.append(Expr({monomial: c * d}) * more)
-                    continue
-                total = result.get(monomial, 0) + c * d
-                if total:
-                    result[monomial] = total
-                else:
-                    del result[monomial]
-        value = Expr(result)
-        for more in rest:
-            value = value + more
-        return value
+        second = Expr.of(other)
+        return self**2 if self._keeps(2) and self.same(second) else _expanded(self, second)
 
     __rmul__ = __mul__
 
@@ -218,6 +206,8 @@ class Expr:
                 "powers: write xp.exp(p * xp.log(x)) for others"
             )
         n = int(exponent)
+        if self._keeps(n):
+            return Expr({((Atom("function", "sum", self), n),): 1})
         base = self if n >= 0 else self.reciprocal()
         result = Expr.of(1)
         for bit in bin(abs(n))[2:]:
@@ -228,6 +218,22 @@ class Expr:
 
     def __rpow__(self, base: Any) -> NoReturn:
         raise FormulaError(f"{base!r} is raised to a recorded power; write xp.exp(x * {base!r}'s logarithm)")
+
+    def _keeps(self, exponent: int) -> bool:
+        """Return whether a power of this is kept as it is.
+
+        (x - c)⁴ expanded would be a small difference of large numbers where x is near c. A square is expanded
+        if terms of it may meet others: in a kinetic energy, and by cos² + sin² = 1.
+        """
+        if exponent < 2 or len(self.terms) < 2:
+            return False
+        moving = [a for a in self.atoms() if any(s.kind != "parameter" for s in Expr.of(a).symbols())]
+        if exponent > 2:
+            return bool(moving)
+        meets = ("sin", "cos")
+        return bool(moving) and not any(
+            a.function in meets or s.kind == "velocity" for a in moving for s in Expr.of(a).symbols()
+        )
 
     def reciprocal(self) -> Expr:
         """Return one over the expression."""
@@ -330,6 +336,29 @@ def _product(first: Monomial, second: Monomial) -> tuple[Monomial, Expr | None]:
     return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text)), more
 
 
+def _expanded(first: Expr, second: Expr) -> Expr:
+    """Return the product of two expressions, term by term."""
+    if len(first.terms) * len(second.terms) > LARGEST_PRODUCT:
+        first, second = (_closed(e) for e in (first, second))
+    result: dict[Monomial, int | Fraction] = {}
+    rest: list[Expr] = []
+    for m, c in first.terms.items():
+        for n, d in second.terms.items():
+            monomial, more = _product(m, n)
+            if more is not None:
+                rest.append(Expr({monomial: c * d}) * more)
+                continue
+            total = result.get(monomial, 0) + c * d
+            if total:
+                result[monomial] = total
+            else:
+                del result[monomial]
+    value = Expr(result)
+    for more in rest:
+        value = value + more
+    return value
+
+
 def _closed(expr: Expr) -> Expr:
     """Return a long sum without velocities as one atom, so that products with it stay short."""
     if len(expr.terms) <= 8 or any(s.kind == "velocity" for s in expr.symbols()):
@@ -391,7 +420,7 @@ def _root(square: Expr) -> Expr | None:
         root = root - term if opposite else root + term
     # An even power is kept apart from a square that comes by chance: only the whole decides.
     odd = any(n % 2 for monomial in root.terms for _, n in monomial) or len(root.terms) > 1
-    return root if odd and (root * root).same(square) else None
+    return root if odd and _expanded(root, root).same(square) else None
 
 
 def _leads_negative(expr: Expr) -> bool:
@@ -467,8 +496,8 @@ def _slope(atom: Atom) -> Expr:
         return Fraction(1, 2) * Expr.of(atom).reciprocal()
     if atom.function == "atan":
         return (1 + x * x).reciprocal()
-    if atom.function == "tanh":
-        return 1 - Expr.of(atom) * Expr.of(atom)
+    if atom.function == "tanh":  # kept whole: its series has all digits also where tanh is nearly 1
+        return Expr.of(Atom("function", "sum", 1 - Expr.of(atom) * Expr.of(atom)))
     return Expr.of(1)  # a sum
 
 

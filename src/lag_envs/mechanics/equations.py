@@ -78,7 +78,12 @@ class EquationsOfMotion:
 
 
 def _degree(monomial: Sequence[tuple[Atom, int]]) -> int:
-    return sum(n for atom, n in monomial if atom.kind == "velocity")
+    return sum(n for atom, n in monomial if atom.kind == "velocity" or _is_power(atom, n))
+
+
+def _is_power(atom: Atom, n: int) -> bool:
+    """Return whether this is a sum of velocities raised to a power."""
+    return n > 0 and atom.function == "sum" and any(s.kind == "velocity" for s in Expr.of(atom).symbols())
 
 
 def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -> EquationsOfMotion:
@@ -131,7 +136,7 @@ def _check_velocities(kinetic: Expr) -> None:
     for monomial in kinetic.terms:
         for atom, n in monomial:
             inside = atom.argument is not None and any(s.kind == "velocity" for s in atom.argument.symbols())
-            if inside or (atom.kind == "velocity" and n < 0):
+            if (inside and not _is_power(atom, n)) or (atom.kind == "velocity" and n < 0):
                 what = atom.text if inside else f"1/{atom.name}"
                 raise FormulaError(
                     f"kinetic has a velocity in a function or denominator: {what:.60}; it must be a "

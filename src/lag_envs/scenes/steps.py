@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.mechanics.evaluation import DualArray, DualArrayFunctions, MotionPoint, exactly
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes.checks import (
     StepRefused,
@@ -118,8 +119,32 @@ def step_bound(
     layout = layout_of(scene)
     of = {("place", name): bounds[0][i] for i, name in enumerate(layout.free)}
     of |= {("velocity", name): bounds[1][i] for i, name in enumerate(layout.free)}
+    if any(e.kind == "momentum" for e in layout.state):
+        end = simulate(scene, start, held[None], dt, lag, applied)[-1]
+        final = held if decays is None else held + (decays > 0.0) * (reached - held) * np.exp(-decays * dt)
+        of |= _momentum_bounds(scene, end, final, *bounds)
     by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in layout.state}
     return StepBound(status, order, by_state, "proved with the step")
+
+
+def _momentum_bounds(
+    scene: Scene, end: Array, control: Array, places: Sequence[float], velocities: Sequence[float]
+) -> dict[tuple[str, str], float]:
+    """Return bounds on each w = v + k(q) at the end of a step, from those on q and v, to first order."""
+    free = layout_of(scene).free
+    unit = np.eye(len(free))
+    numbers = [
+        DualArray(x, unit[free.index(e.coordinate)]) if e.kind == "place" and e.coordinate in free else x
+        for e, x in zip(layout_of(scene).state, end, strict=True)
+    ]
+    point = MotionPoint(
+        scene.mechanics, exactly(parameter_values(scene)), numbers, list(control), DualArrayFunctions
+    )
+    slopes = [k.slope if isinstance(k, DualArray) else np.zeros(len(free)) for k in point.shift]
+    return {
+        ("momentum", name): v + float(np.abs(slope) @ places)
+        for name, v, slope in zip(free, velocities, slopes, strict=True)
+    }
 
 
 def jacobian(

@@ -279,11 +279,8 @@ class Lowering:
             if key[0] == "pair":  # both are made at once; each is the other's slope
                 self.nodes += [("sin", (x, first + 1, *rate), (), 0), ("cos", (x, first, *rate), (), 0)]
             elif atom.function == "tanh":  # the slope is 1 - tanh²
-                self.nodes += [
-                    ("tanh", (x, first + 2, *rate), (), 0),
-                    ("product", (first, first), (), 0),
-                    ("sum", (first + 1,), (-1.0, 1.0), 0),
-                ]
+                self.nodes.append(("tanh", (x, first + 2, *rate), (), 0))
+                self._node("sum", (self._product(first, first),), (-1.0, 1.0))
             else:
                 self.nodes.append((atom.function, (x, first if slope is None else slope, *rate), (), 0))
         return self._known[key] + (atom.function == "cos")
