@@ -77,12 +77,12 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
             )
 
 
-def behaviour_of(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
+def behaviour_of(env_id: str) -> dict[str, dict[str, list[float | None]]]:
     """Return the measures of an environment's agents: for each agent and measure, a number per policy."""
     found: dict[str, dict[str, list[float | None]]] = {}
     for name, policies in agents(env_id):
         rows = [
-            measures(record_rollout(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies
+            measures(record_rollout(Rollout(env_id, policy, fresh_seeds(EPISODES)))) for policy in policies
         ]
         found[name] = {key: [row[key] for row in rows] for key in rows[0]}
     return found

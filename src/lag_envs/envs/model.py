@@ -130,9 +130,7 @@ class Model:
         refused = self._step(states, actions, targets, self._numbers, ends, rewards, ended)
         if refused:
             state, action = states[refused - 1], actions[refused - 1]
-            raise self.task.formulas.refusal(
-                state, action, self.task.dt, None, f"the step of row {refused - 1}"
-            )
+            raise self.task.formulas.refusal(state, action, self.task.dt, f"the step of row {refused - 1}")
         return ends, rewards, ended
 
     def _checked(

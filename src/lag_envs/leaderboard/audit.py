@@ -87,22 +87,15 @@ class Finding:
 # --- what is cheap ------------------------------------------------------------------------------------------
 
 
-def sound(board: Board, pin: Path | None = None) -> tuple[BoardState, Results]:
+def sound(board: Board) -> tuple[BoardState, Results]:
     """Return a board's state and its results, by protocol and id, if all cheap checks pass.
-
-    Parameters
-    ----------
-    board : Board
-        The board.
-    pin : Path, optional
-        Pin to compare the log with; by default the release's own, if it is of this board.
 
     Raises
     ------
     BoardError
         For the first check that fails; the text names the line and the remedy.
     """
-    found = cheap(board, pin)
+    found = cheap(board)
     # History names the line that was changed; the chain only the next line that does not follow.
     findings = sorted(found.findings, key=lambda finding: finding.name != "history")
     wrong = [text for finding in findings for text in finding.wrong]

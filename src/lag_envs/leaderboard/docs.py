@@ -78,11 +78,7 @@ def top(data: dict[str, Any]) -> str:
         first = [row for row in best if row["rank"] == best[0]["rank"]]
         learned = [row for row in best if row["kind"] == "learned"][:1]
         if first:
-            names = [
-                ", ".join(f"{plain_markdown(row['name'])} {_scored(row)}" for row in some)
-                for some in (first, learned)
-            ]
-            rows.append([environment["id"], *names])
+            rows.append([environment["id"], _listed(first), _listed(learned)])
     if not rows:
         return "Nothing has been submitted yet."
     return markdown_table(("environment", "best (95 % interval)", "best learned"), rows)

@@ -29,7 +29,6 @@ LOG = "board.jsonl"
 #: Largest log [bytes].
 MOST = 2**26
 STATES = ("pending", "verified", "rejected", "superseded", "withdrawn")
-KINDS = ("learned", "controller", "optimal")
 REMEDY = "restore it from version control"
 #: All of one length and in UTC, so that they sort as text, and none in a future that a clock cannot pass.
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"

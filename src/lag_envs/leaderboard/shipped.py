@@ -53,13 +53,13 @@ def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
     return {env_id: Shipped(**entry) for env_id, entry in found.items()}
 
 
-def load(env_id: str, folder: Path = FOLDER) -> Any:
+def load(env_id: str) -> Any:
     """Return an environment's policy, with the `predict` of Stable-Baselines3."""
     from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
     from lag_envs.leaderboard.submission import read_arrays
 
-    made = architecture(env_id, shipped(folder)[env_id].policy)
-    file = folder / f"{env_id}.safetensors"
+    made = architecture(env_id, shipped()[env_id].policy)
+    file = FOLDER / f"{env_id}.safetensors"
     return SubmittedPolicy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
 
 

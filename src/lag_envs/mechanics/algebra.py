@@ -337,9 +337,6 @@ def _closed(expr: Expr) -> Expr:
     return Expr({((Atom("function", "sum", expr), 1),): 1})
 
 
-FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
-
-
 def function_of(name: str, argument: Any) -> Expr:
     """Return a function of an expression."""
     argument = Expr.of(argument)
