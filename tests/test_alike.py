@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_submission import (
+from small_submissions import (
     ABOUT,
     FEEDBACK,
     GRID,

@@ -305,7 +305,7 @@ def test_a_submission_is_changed_after_verification(board, how):
     else:
         shutil.rmtree(folder)
         shutil.copytree(board.submission(entry_of(board, "clone").id), folder)
-    if how != "a link":  # the real `load` refuses it, see tests/test_submission.py
+    if how != "a link":  # the real `load` refuses it, see tests/test_hostile_submissions.py
         assert f"line {entry.line}: {folder} is not what was added" in refused(board)
         assert "submissions" in wrong(board)
 
