@@ -14,7 +14,7 @@ import pytest
 from covering import covering
 from pictures import TASKS, length, moment, shown
 
-from lag_envs.envs import raster, rendering
+from lag_envs.envs import painting, raster, readout, rendering
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import (
     Role,
@@ -26,7 +26,7 @@ pygame = pytest.importorskip("pygame")
 
 
 def test_every_role_has_a_style():
-    assert set(rendering.STYLES) == set(get_args(Role))
+    assert set(painting.STYLES) == set(get_args(Role))
 
 
 def test_round_lengths_and_ticks():
@@ -37,15 +37,15 @@ def test_round_lengths_and_ticks():
 
 
 def test_dashes_cover_the_line():
-    dashes = list(rendering._dashes([(0.0, 0.0), (7.0, 0.0), (7.0, 13.0)], 3.0, 2.0))
+    dashes = list(painting._dashes([(0.0, 0.0), (7.0, 0.0), (7.0, 13.0)], 3.0, 2.0))
     assert sum(length(dash) for dash in dashes) == pytest.approx(3.0 * 4)
     assert dashes[0] == [(0.0, 0.0), (3.0, 0.0)]
     assert dashes[1] == [(5.0, 0.0), (7.0, 0.0), (7.0, 1.0)]
 
 
 def test_numbers_keep_their_width():
-    assert [rendering._number(x) for x in (-1.5, 12.345, -419.0)] == ["−1.500", "12.35", "−419.0"]
-    assert rendering._number(123456.0) == "1.23e+05"
+    assert [readout._number(x) for x in (-1.5, 12.345, -419.0)] == ["−1.500", "12.35", "−419.0"]
+    assert readout._number(123456.0) == "1.23e+05"
 
 
 # --- polygons ---
@@ -91,7 +91,7 @@ def test_png_can_be_read(tmp_path):
 
 def test_colours_and_widths_are_those_of_the_page():
     """`site.js` paints the same shapes in a browser; its style sheet has the colours of light and dark."""
-    site = Path(rendering.__file__).parents[1] / "leaderboard" / "site" / "static"
+    site = Path(painting.__file__).parents[1] / "leaderboard" / "site" / "static"
     css = (site / "site.css").read_text(encoding="utf-8").partition("@media")[0]
     colour = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", css))
     roles = re.search(r"ink\.roles = \{(.*?)\n    \};", (site / "site.js").read_text(encoding="utf-8"), re.S)
@@ -100,14 +100,14 @@ def test_colours_and_widths_are_those_of_the_page():
         fill, edge, width, *dash = re.findall(r'get\("([\w-]+)"\)|null|([\d.]+)', given)
         numbers = [float(x[1]) for x in (width, *dash)]
         fills = colour[fill[0]] if fill[0] else None
-        found[role] = rendering.Style(fills, colour[edge[0]], numbers[0], tuple(numbers[1:]) or None)
-    assert found == rendering.STYLES
+        found[role] = painting.Style(fills, colour[edge[0]], numbers[0], tuple(numbers[1:]) or None)
+    assert found == painting.STYLES
 
 
 @pytest.fixture(scope="module")
 def page():
     """The page's painter in a browser, on an empty page."""
-    site = Path(rendering.__file__).parents[1] / "leaderboard" / "site" / "static"
+    site = Path(painting.__file__).parents[1] / "leaderboard" / "site" / "static"
     chromium = shutil.which(os.environ.get("CHROMIUM", "chromium"))
     if chromium is None:
         missing = "THERE IS NO CHROMIUM, SO PICTURES WERE NOT HELD AGAINST THE PAGE'S: install chromium"
@@ -153,7 +153,7 @@ def test_pictures_are_those_of_the_page(env_id, page):
 
     task = TASKS[env_id]
     now, picture = moment(task), Picture(task)
-    by_page = page.evaluate(PAINT, [scenery.picture_data(picture), picture.poses(now), rendering.MARGIN])
+    by_page = page.evaluate(PAINT, [scenery.picture_data(picture), picture.poses(now), painting.MARGIN])
     png = io.BytesIO(base64.b64decode(by_page.partition(",")[2]))
     by_page = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
     apart = np.abs(by_page - rendering.paint(task, now)).max(axis=2)

@@ -11,7 +11,8 @@ from pictures import IDS, TASKS, length, moment, picture, shown
 from rollouts import SINGLE
 
 import lag_envs
-from lag_envs.envs import rendering
+from lag_envs.envs import painting, rendering
+from lag_envs.envs.readout import STRIP_PAPER
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import (
@@ -271,7 +272,7 @@ def test_record_video_without_a_warning(env_id, tmp_path):
 
 
 def colours(frame, *wanted):
-    return [int(np.all(frame == rendering._rgb(colour), axis=-1).sum()) for colour in wanted]
+    return [int(np.all(frame == painting.rgb(colour), axis=-1).sum()) for colour in wanted]
 
 
 # --- optional displays ---
@@ -280,13 +281,13 @@ def colours(frame, *wanted):
 @pytest.mark.parametrize("env_id", covering())
 def test_nothing_more_is_shown_unless_it_is_asked_for(env_id):
     plain = shown(env_id)
-    assert max(colours(plain, rendering.FORCE.edge, rendering.STRIP_PAPER)) < 20
+    assert max(colours(plain, painting.FORCE.edge, STRIP_PAPER)) < 20
     assert np.array_equal(plain, shown(env_id, show_arrows=False, show_trail=0.0, show_readout=False))
     arrows, readout = shown(env_id, show_arrows=True), shown(env_id, show_readout=True)
     unseen = not any(isinstance(s, Arrow) for s in TASKS[env_id].shapes(moment(TASKS[env_id])))
     forces = TASKS[env_id].scene.forces(TASKS[env_id].centre)
-    assert (colours(arrows, rendering.FORCE.edge)[0] > 20) == bool(forces or unseen)
-    assert colours(readout, rendering.STRIP_PAPER)[0] > 0.6 * 600 * 48
+    assert (colours(arrows, painting.FORCE.edge)[0] > 20) == bool(forces or unseen)
+    assert colours(readout, STRIP_PAPER)[0] > 0.6 * 600 * 48
     assert not np.array_equal(plain[:352], readout[:352])  # there is less room
     assert not np.array_equal(plain, shown(env_id, show_trail=1.0))
 

@@ -246,10 +246,10 @@ def _state(task: Any, theta: float, speed: float) -> list[float]:
     return state
 
 
-def _largest(good: Callable[[float], bool]) -> float:
+def _largest(good: Callable[[float], bool], steps: int = 40) -> float:
     """Return the largest speed up to 1e4 rad/s that passes, by bisection."""
     low, high = 0.0, 1e4
-    for _ in range(40):
+    for _ in range(steps):
         middle = math.sqrt(max(low, 1e-2) * high)
         low, high = (middle, high) if good(middle) else (low, middle)
     return low
