@@ -98,7 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
-        "env", nargs="*", metavar="ID", help="measure some environments; others keep their numbers"
+        "env",
+        nargs="*",
+        metavar="ID",
+        help="environments (default: all); the others keep their numbers",
     )
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or [env_id for env_id, task in TASKS.items() if task.goal]

@@ -157,7 +157,7 @@ def entrants(env_id: str, runs: Path, cache: Path) -> Iterator[tuple[str, Callab
 
 
 def folder_part(name: str) -> str:
-    """Return a name as part of a folder's."""
+    """Return a name in the form that folder names use."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 

@@ -285,7 +285,7 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
 
 
 def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
-    """Return the next event, or ("end", name, reason), or None; write files that were told."""
+    """Return the next event, or ("end", name, reason), or None; write the files that events bring."""
     ended = next((future for future in futures if future.done()), None)
     try:
         event = events.get(timeout=0.05 if ended else 0.2)

@@ -53,7 +53,7 @@ def test_a_submission_waits_for_a_nonce_that_was_published_after_it(board):
 
 
 @pytest.mark.parametrize("nonce", ["", "two words", "a\nb", "ü", "x" * 201])
-def test_nonces_that_are_none(board, nonce):
+def test_bad_nonces_are_refused(board, nonce):
     with pytest.raises(BoardError, match="a nonce is 1 to 200"):
         board.publish(nonce)
 
@@ -88,7 +88,7 @@ def test_adding_twice_changes_nothing(board):
     assert events(board) == ["protocol", "added", "nonce", "verified"]
 
 
-def test_other_files_of_the_same_id_are_not_taken_for_those_that_are_there(board, monkeypatch):
+def test_an_id_that_other_files_have_is_refused(board, monkeypatch):
     id = add(board)
     monkeypatch.setattr(module, "id_of", lambda submission: id)
     with pytest.raises(BoardError, match="taken by other files"):
@@ -176,7 +176,7 @@ def test_files_that_change_while_they_are_copied(board, monkeypatch):
 
 
 @pytest.mark.parametrize("verified", [True, False])
-def test_who_comes_back_finds_the_luck_of_the_first_time(board, verified):
+def test_a_submission_that_comes_back_keeps_its_first_nonce(board, verified):
     id = add(board)
     board.publish("1")
     if verified:
@@ -192,7 +192,7 @@ def test_who_comes_back_finds_the_luck_of_the_first_time(board, verified):
     assert events(board).count("verified") == 1
 
 
-def test_who_comes_back_does_not_displace_what_came_later(board):
+def test_a_submission_that_comes_back_does_not_displace_later_ones(board):
     old = add(board, nonce="1", score=0.9)
     board.withdraw(old, "a better one is coming")
     new = add(board, nonce="2", score=0.1)
@@ -209,7 +209,7 @@ def shown(board):
 # --- those that act alike ---
 
 
-def test_who_acts_like_an_earlier_one_is_shown_without_a_rank(board):
+def test_a_submission_that_acts_like_an_earlier_one_has_no_rank(board):
     add(board, nonce="1", acts="x", score=0.5)
     add(board, "other", nonce="2", score=0.3)
     add(board, "clone", nonce="3", authors=["B"], acts="x", score=0.7)
@@ -219,7 +219,7 @@ def test_who_acts_like_an_earlier_one_is_shown_without_a_rank(board):
     }  # fmt: skip
 
 
-def test_the_first_is_who_was_added_first_whoever_is_verified_first(board, monkeypatch):
+def test_the_first_is_the_first_added_not_the_first_verified(board, monkeypatch):
     failing = [True]
     real = fake_submissions.recompute
 
@@ -239,7 +239,7 @@ def test_the_first_is_who_was_added_first_whoever_is_verified_first(board, monke
     assert shown(board) == {"clone": (None, "PPO"), "PPO": (1, None)}
 
 
-def test_better_luck_is_not_had_by_submitting_the_same_again(board):
+def test_submitting_the_same_again_brings_no_better_luck(board):
     first = add(board, nonce="1", acts="x")
     again = add(board, nonce="2", acts="x", score=0.51)
     assert states(board) == {first: "verified", again: "verified"}  # it does not replace the first

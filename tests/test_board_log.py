@@ -164,7 +164,7 @@ def test_times_grow_even_if_the_clock_is_set_back(board):
         add(board, "TQC")
 
 
-def test_two_clones_that_both_added(board, tmp_path):
+def test_additions_of_two_clones_conflict(board, tmp_path):
     """Git's merge is a conflict; the second to push takes the other's log and adds again."""
     add(board, nonce="1")
     first, second = tmp_path / "first", tmp_path / "second"

@@ -91,7 +91,7 @@ def modules():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module", list(modules()))
-def test_so_has_every_module_that_is_run(module, capsys):
+def test_every_module_that_is_run_has_help_with_examples(module, capsys):
     try:
         importlib.import_module(module).main(["--help"])
     except SystemExit as end:

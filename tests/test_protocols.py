@@ -135,7 +135,7 @@ def test_a_log_from_before_there_were_protocols_in_it(board):
     old = "".join(json.dumps({k: v for k, v in line.items() if k != "prev"}) + "\n" for line in lines)
     board.log.write_text(old)
     assert states(board) == {id: "verified"}
-    with pytest.raises(BoardError, match="does not tell the scale of protocol 1"):
+    with pytest.raises(BoardError, match="does not state the scale of protocol 1"):
         add(board, "TQC")
     assert board_data(board)["environments"][0]["rows"] == []
     assert board.open() == 1

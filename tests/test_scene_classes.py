@@ -85,7 +85,7 @@ def test_other_ways_of_dataclasses():
     assert Own(4.0).acceleration([1.0, 0.0])["x"] == -0.5
 
 
-def test_singular_state_is_its_own_affair():
+def test_a_singular_state_does_not_make_a_scene_invalid():
     class Polar(Scene):
         coordinates = {"r": "m", "phi": "rad"}
 
@@ -257,7 +257,7 @@ def test_class_that_no_module_has_goes_by_value():
         assert second == "mass must be above 0 kg, got -1 kg"
 
 
-def test_class_whose_module_is_not_there():
+def test_class_of_a_missing_module_works():
     """It was sent by value, before its first use, to a process that cannot import its module."""
     control = {"modes": {"push": {"force": "N"}}, "controls": {}, "__module__": "nowhere"}
     assert type("Moved", (cart(False),), control)().control == "push"

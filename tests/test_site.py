@@ -85,7 +85,7 @@ def test_little_is_enough():
     assert "protocol 0" in pages["Gone-v0-protocol-0.html"]
 
 
-def test_who_acts_like_another_or_looks_like_one_is_shown_as_such():
+def test_likeness_of_acts_and_of_names_is_shown():
     found = board_pages.data((incline.Brake.id,))
     rows = found["environments"][0]["rows"]
     like = {"id": f"{incline.Brake.id}-first", "name": "The <first>", "state": "withdrawn"}

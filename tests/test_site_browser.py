@@ -516,7 +516,7 @@ def test_page_is_light_before_anything_is_played(served, browser, name):
 
 
 @pytest.mark.slow
-def test_so_is_every_page_of_the_board(browser, tmp_path):
+def test_every_page_of_the_board_is_light_too(browser, tmp_path):
     """The longest episodes, with up to thousands of steps."""
     write_page(board_data(Board(Path(__file__).parents[1] / "leaderboard")), tmp_path)
     for env_id in TASKS:

@@ -331,7 +331,7 @@ def test_on_a_local_ray_cluster(command, config, tmp_path):
     assert [json.loads((f / run.RESULT).read_text())["evaluation"]["returns"] for f in here] == returns
 
 
-def test_ray_that_is_not_there(command, config):
+def test_a_missing_ray_is_named(command, config):
     status, output = command(ENV, "--config", str(config), "--ray", "127.0.0.1:1")
     assert status == 2 and ("pip install" in output or "no Ray cluster at" in output)
 

@@ -52,7 +52,7 @@ def needs(extra: str, *packages: str) -> None:
 
 
 def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
-    """Declare the option of a date to note in a result."""
+    """Declare the option for the date that a result is given."""
     today = date.today().isoformat()
     parser.add_argument("--date", default=today, help=f"date to note {where} (default: today)")
 

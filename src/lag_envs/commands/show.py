@@ -54,7 +54,7 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         "--board",
         metavar="FOLDER",
         type=Path,
-        help="a board, to find agents by name (default: the folder leaderboard, if there is one here)",
+        help="a board in which to look up agents by name (default: the folder leaderboard, if it exists)",
     )
 
 

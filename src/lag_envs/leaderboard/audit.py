@@ -114,7 +114,7 @@ class CheapChecks:
     lines: list[LogLine] = field(default_factory=list)
     state: BoardState = field(default_factory=BoardState)
     results: Results = field(default_factory=dict)
-    #: What each submission says of itself, by id.
+    #: What each submission says about itself, by id.
     abouts: dict[str, About] = field(default_factory=dict)
 
     def chained(self, number: int) -> bool:
@@ -280,7 +280,7 @@ def _odd(found: CheapChecks, entry: BoardEntry, result: Mapping[str, Any]) -> It
         if tuple(policy["seed"] for policy in result["policies"]) != submission.seeds:
             yield "has other policies than the submission"
         if result.get("claimed") != claimed(submission):
-            yield "does not repeat what the submission says of itself"
+            yield "does not repeat what the submission says about itself"
     middle, chosen = shown_episodes(result)
     first = protocol.first_seed(entry.digest, entry.nonce, middle)
     returns = result["policies"][middle]["returns"]
@@ -354,7 +354,7 @@ def _history(board: Board, log: bytes) -> Finding:
             )
         found.told = f"{len(tagged) - before} earlier versions are the beginning of this one"
         if before:
-            found.told += f"; {before} are of boards that were begun again before there was a chain"
+            found.told += f"; {before} belong to boards that were started over before logs had a chain"
         if git(folder, "rev-parse", "--is-shallow-repository").strip() == b"true":
             found.told += "; the clone is shallow, so there may be more"
     except NoHistory as error:

@@ -340,7 +340,7 @@ class BoardState:
         return [entry for entry in self.entries.values() if entry.state == "pending"]
 
     def first(self, entry: BoardEntry) -> BoardEntry | None:
-        """Return the first submission that acts like this one, None if that is this one.
+        """Return the first submission that acts like this one; None if it is the first itself.
 
         Likeness is noted with the one that was verified later; the one that was added later is linked. Links
         are followed to their end.

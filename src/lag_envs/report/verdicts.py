@@ -57,7 +57,7 @@ class Duel(NamedTuple):
 
     @property
     def lost(self) -> bool:
-        """Whether a rival is faster, or alone in reaching the error."""
+        """Whether a rival is faster, or the only one that reaches the error."""
         return self.rival is not None and (self.ratio is None or self.ratio < 1.0)
 
     @property
