@@ -340,7 +340,8 @@ def current(state: BoardState, what: str) -> Protocol:
     found = state.protocols.get(state.number)
     if found is None:
         raise BoardError(
-            f"the log does not state the scale of protocol {state.number}; `lag-envs leaderboard open` adds it"
+            f"the log does not state the scale of protocol {state.number}; "
+            "`lag-envs leaderboard open` adds it"
         )
     frozen = found.rules.model_dump()
     if odd := [name for name, rule in protocol.rules().items() if rule != frozen[name]]:

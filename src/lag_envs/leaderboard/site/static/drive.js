@@ -238,7 +238,7 @@
     return (episode) => actionsFrom(numbers(episode), about);
   }
 
-  /** Numbers as an action: clipped where it lies in a range, for lists, the largest number of each chooses. */
+  /** Numbers as an action: clipped in a range; in a list, the largest number chooses. */
   function actionsFrom(numbers, { choices, largest }) {
     if (!choices.length) return Array.from(numbers, (x) => Math.fround(clamp(x, -largest, largest)));
     let end = 0;
