@@ -7,7 +7,6 @@ learned policies that are verified on the board. It writes ``agents/results/beha
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -25,6 +24,7 @@ from lag_envs.evaluation.rollout import Episodes, Rollout, record_rollout
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.submission import load
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
 BOARD, OUTPUT = ROOT / "leaderboard", ROOT / "agents" / "results" / "behaviour.json"
@@ -91,11 +91,10 @@ def behaviour_of(env_id: str) -> dict[str, dict[str, list[float | None]]]:
 @reports_errors("agents.behaviour")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.behaviour",
-        description=__doc__,
-        epilog="examples:\n  python -m agents.behaviour\n  python -m agents.behaviour PivotedBar-v0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.behaviour",
+        __doc__,
+        "examples:\n  python -m agents.behaviour\n  python -m agents.behaviour PivotedBar-v0",
     )
     p.add_argument(
         "env",

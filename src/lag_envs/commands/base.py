@@ -13,7 +13,7 @@ from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
 
 if TYPE_CHECKING:
-    from lag_envs.tasks.base import Task
+    pass
 
 #: Alternative to ids in `report`, `info`, `bench` and `play`.
 OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
@@ -37,11 +37,6 @@ def known_id(id: str) -> str:
         f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')} "
         "(a file of your own ends with .py)"
     )
-
-
-def task_of(id: str) -> Task:
-    """Return the task of a known id, with its defaults."""
-    return TASKS[id]()
 
 
 def needs(extra: str, *packages: str) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.envs.program import constants_of, program_for
+from lag_envs.envs.program import program_for
 from lag_envs.envs.reverse import Reverse
 from lag_envs.envs.single import absent
 from lag_envs.scenes.checks import check_parameters, real_array
@@ -85,7 +85,7 @@ class Model:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        constants = constants_of(task)
+        constants = task.formulas.constants()
         program = program_for(task, absent([constants]))
         self._constants = SimpleNamespace(**constants)
         self._numbers = np.array([constants[name] for name in program.uniform])

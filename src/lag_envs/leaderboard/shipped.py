@@ -7,7 +7,6 @@ that the least score per byte is lost. Controllers are in the package anyway.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lag_envs.errors import UserError
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
 FOLDER = Path(__file__).parent / "best"
@@ -152,11 +152,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Choose and write the policies."""
     from lag_envs.leaderboard.board import Board, BoardError
 
-    parser = argparse.ArgumentParser(
-        prog="python -m lag_envs.leaderboard.shipped",
-        description="Write the policies that come with the package: the best on the board, as data.",
-        epilog="examples:\n  python -m lag_envs.leaderboard.shipped",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = module_parser(
+        "lag_envs.leaderboard.shipped",
+        "Write the policies that come with the package: the best on the board, as data.",
+        "examples:\n  python -m lag_envs.leaderboard.shipped",
     )
     parser.add_argument(
         "--board", metavar="FOLDER", type=Path, default=Path("leaderboard"), help="default: leaderboard"
