@@ -165,12 +165,9 @@ SYSTEMS = {
 
 
 class Engine(LibraryRival):
-    """A rival with its own model, made of a system's links."""
+    """A rival with its own model, made of a system's links; it takes one state after the other."""
 
-    @property
-    def batched(self) -> bool:
-        """It takes one state after the other."""
-        return False
+    batched = False
 
 
 def _given(problems: Problems) -> tuple[System, Array, Array, Array]:
