@@ -12,7 +12,7 @@ from covering import covering
 from pictures import IDS, picture
 from rollouts import SINGLE
 
-from lag_envs.envs import rendering, windows
+from lag_envs.envs import rendering, screen
 from lag_envs.tasks import cylinder_in_cylinder, incline
 
 pygame = pytest.importorskip("pygame")
@@ -120,7 +120,7 @@ def test_missing_display_is_named(monkeypatch):
 def test_missing_pygame_is_named_with_its_remedy(monkeypatch):
     env = gym.make("PivotedBar-v0", render_mode="rgb_array")
     written = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True)
-    windows.load_pygame.cache_clear()
+    screen.load_pygame.cache_clear()
     monkeypatch.setitem(sys.modules, "pygame", None)
     for without in (env, written):
         without.reset(seed=1)

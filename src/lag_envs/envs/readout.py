@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.envs.painting import STYLES
-from lag_envs.envs.windows import load_pygame
+from lag_envs.envs.screen import load_pygame
 from lag_envs.scenes.shapes import Reading, round_length
 
 if TYPE_CHECKING:

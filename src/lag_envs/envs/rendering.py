@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lag_envs.envs.forces import Forces
 from lag_envs.envs.painting import FORCE, STYLES, TRAIL, Pen, StyledShape
 from lag_envs.envs.readout import STRIP, write_readout
-from lag_envs.envs.windows import desk, load_pygame
+from lag_envs.envs.screen import desk, load_pygame
 from lag_envs.scenes import shapes as s
 from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import Frame, Point, Pose, Reading, in_plane

@@ -1,4 +1,4 @@
-"""The window of the process, which all viewers share."""
+"""The window on the screen, which all viewers of a process share."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Shown(Protocol):
 
 
 class Desk:
-    """The window of the process, which the viewers share."""
+    """Keeps the window, and the places of the viewers in it."""
 
     def __init__(self) -> None:
         # Weak, so that an environment that was dropped without being closed does not keep its place.
