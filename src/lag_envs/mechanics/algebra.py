@@ -17,6 +17,7 @@ import math
 import numbers
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
+from functools import partial
 from typing import Any, ClassVar, NoReturn
 
 Monomial = tuple[tuple["Atom", int], ...]
@@ -399,40 +400,15 @@ class RecordedFunctions:
     """The namespace ``xp`` of a formula that is recorded."""
 
     pi = math.pi
-
-    def sin(self, x: Any) -> Any:
-        """Return the sine."""
-        return function_of("sin", x)
-
-    def cos(self, x: Any) -> Any:
-        """Return the cosine."""
-        return function_of("cos", x)
+    sin, cos, exp, log, sqrt, atan, tanh = (
+        staticmethod(partial(function_of, name))
+        for name in ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
+    )
+    arctan = atan
 
     def tan(self, x: Any) -> Any:
         """Return the tangent."""
         return function_of("sin", x) / function_of("cos", x)
-
-    def exp(self, x: Any) -> Any:
-        """Return the exponential."""
-        return function_of("exp", x)
-
-    def log(self, x: Any) -> Any:
-        """Return the natural logarithm."""
-        return function_of("log", x)
-
-    def sqrt(self, x: Any) -> Any:
-        """Return the square root."""
-        return function_of("sqrt", x)
-
-    def atan(self, x: Any) -> Any:
-        """Return the inverse tangent."""
-        return function_of("atan", x)
-
-    def tanh(self, x: Any) -> Any:
-        """Return the hyperbolic tangent."""
-        return function_of("tanh", x)
-
-    arctan = atan
 
     def __getattr__(self, name: str) -> Any:
         raise FormulaError(
