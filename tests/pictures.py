@@ -7,9 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 import lag_envs
-from lag_envs.scenes.shapes import (
-    Frame,
-)
+from lag_envs.scenes.shapes import Frame
 from lag_envs.tasks import incline
 
 IDS = list(lag_envs.TASKS)

@@ -425,7 +425,7 @@ def test_an_older_checkout_is_no_forgery(board):
 
 
 @needs_git
-def test_boards_that_were_begun_again_before_there_was_a_chain(board):
+def test_boards_that_were_started_over_before_logs_had_a_chain(board):
     """As in the repository itself: that does not help anybody who begins again later."""
     folder = board.folder.parent
     shutil.rmtree(folder / ".git")
@@ -436,7 +436,7 @@ def test_boards_that_were_begun_again_before_there_was_a_chain(board):
     board.log.write_bytes(whole)
     commit(board)
     found = audit.cheap(board)
-    assert "1 are of boards that were begun again" in found.findings[2].told and not refused(board)
+    assert "1 belong to boards that were started over" in found.findings[2].told and not refused(board)
 
 
 def test_without_a_repository(board):

@@ -16,11 +16,7 @@ from pictures import TASKS, length, moment, shown
 
 from lag_envs.envs import painting, raster, readout, rendering
 from lag_envs.scenes.picture import Picture
-from lag_envs.scenes.shapes import (
-    Role,
-    round_length,
-    ticks,
-)
+from lag_envs.scenes.shapes import Role, round_length, ticks
 
 pygame = pytest.importorskip("pygame")
 

@@ -15,18 +15,7 @@ from lag_envs.envs import painting, rendering
 from lag_envs.envs.readout import STRIP_PAPER
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.picture import Picture, left_out_rates
-from lag_envs.scenes.shapes import (
-    Arrow,
-    Circle,
-    Frame,
-    Line,
-    Polygon,
-    Pose,
-    Ruler,
-    Window,
-    beginning,
-    placed,
-)
+from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Polygon, Pose, Ruler, Window, beginning, placed
 from lag_envs.tasks import Task, cylinder_in_cylinder, incline, pivoted_bar
 
 pygame = pytest.importorskip("pygame")
