@@ -7,7 +7,6 @@ learned policies that are verified on the board. It writes ``agents/results/beha
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -25,6 +24,7 @@ from lag_envs.evaluation.rollout import Episodes, Rollout, record_rollout
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.submission import load
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
 BOARD, OUTPUT = ROOT / "leaderboard", ROOT / "agents" / "results" / "behaviour.json"
@@ -77,12 +77,12 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
             )
 
 
-def behaviour_of(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
+def behaviour_of(env_id: str) -> dict[str, dict[str, list[float | None]]]:
     """Return the measures of an environment's agents: for each agent and measure, a number per policy."""
     found: dict[str, dict[str, list[float | None]]] = {}
     for name, policies in agents(env_id):
         rows = [
-            measures(record_rollout(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies
+            measures(record_rollout(Rollout(env_id, policy, fresh_seeds(EPISODES)))) for policy in policies
         ]
         found[name] = {key: [row[key] for row in rows] for key in rows[0]}
     return found
@@ -91,14 +91,16 @@ def behaviour_of(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, l
 @reports_errors("agents.behaviour")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.behaviour",
-        description=__doc__,
-        epilog="examples:\n  python -m agents.behaviour\n  python -m agents.behaviour PivotedBar-v0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.behaviour",
+        __doc__,
+        "examples:\n  python -m agents.behaviour\n  python -m agents.behaviour PivotedBar-v0",
     )
     p.add_argument(
-        "env", nargs="*", metavar="ID", help="measure some environments; others keep their numbers"
+        "env",
+        nargs="*",
+        metavar="ID",
+        help="environments (default: all); the others keep their numbers",
     )
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or [env_id for env_id, task in TASKS.items() if task.goal]

@@ -24,6 +24,7 @@ from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import Contestant, Run, measure_rates
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import ONE_THREAD, machine
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
 
@@ -34,11 +35,10 @@ TRAINED = 64  #: environments of the learner
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.bench",
-        description=f"Compare our vector environment for Stable-Baselines3 with DummyVecEnv, on {ENV}.",
-        epilog="examples:\n  python -m agents.bench\n  python -m agents.bench --output adapter.json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.bench",
+        f"Compare our vector environment for Stable-Baselines3 with DummyVecEnv, on {ENV}.",
+        "examples:\n  python -m agents.bench\n  python -m agents.bench --output adapter.json",
     )
     p.add_argument("--rounds", type=int, default=15, help="samples of each (default %(default)s)")
     p.add_argument("--output", type=Path, metavar="FILE", help="keep all samples as JSON")

@@ -6,7 +6,6 @@ entries of the state; the others are 0, and so is the target. Coarse grids are e
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 from agents.optimum import DEFAULT_FOLDER, Solution, solvable
 from agents.run import check_env, reports_errors
 from lag_envs import TASKS
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
 POINTS = 61  #: along each axis
@@ -63,11 +63,10 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
 @reports_errors("agents.board_values")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files."""
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.board_values",
-        description=__doc__,
-        epilog="examples:\n  python -m agents.board_values\n  python -m agents.board_values PivotedBar-v0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = module_parser(
+        "agents.board_values",
+        __doc__,
+        "examples:\n  python -m agents.board_values\n  python -m agents.board_values PivotedBar-v0",
     )
     parser.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")

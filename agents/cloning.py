@@ -18,7 +18,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
 from agents.learners import LearnerSettings, trainable
@@ -29,7 +28,6 @@ from lag_envs.envs.stagger import stagger
 from lag_envs.tasks.base import Task
 
 NAME = "cloning"  #: see `agents.learners.OWN`
-Array = NDArray[np.float32]
 
 
 class Settings(LearnerSettings):

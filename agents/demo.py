@@ -22,6 +22,7 @@ from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparam
 from agents.run import RESULT, Run, UserError, fresh_seeds, known_name, own_env, reports_errors
 from agents.train import command, here, show_progress
 from lag_envs.evaluation.rollout import play
+from lag_envs.options import module_parser
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
@@ -48,11 +49,10 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.demo",
-        description="Train a learner on an environment and evaluate it over 20 fresh episodes beside others.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.demo",
+        "Train a learner on an environment and evaluate it over 20 fresh episodes beside others.",
+        EPILOG,
     )
     p.add_argument(
         "--env", default="PivotedBar-v0", metavar="ENV",

@@ -121,7 +121,7 @@ def learned_policy(env_id: str, folder: Path) -> Entrant:
     if (result.get("env"), result.get("algo"), str(result.get("seed"))) != own:
         raise UserError(
             f"{folder / RESULT} is of {result.get('env')} {result.get('algo')} seed {result.get('seed')},"
-            " not of what its folder says; move the run to where it belongs"
+            " which is not what its folder says; move it to the right folder"
         )
     try:
         float(result["wall_seconds"]), int(result["trained"]), result["hyperparameters"], result["steps"]

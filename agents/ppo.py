@@ -38,6 +38,7 @@ from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
 from agents.train import command, here, planned_runs, print_returns, show_progress
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
 NAME = "fast_ppo"  #: see `agents.learners.OWN`
@@ -394,11 +395,8 @@ OPTIONS = [name for name in Settings.model_fields if name != "n_timesteps"]
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.ppo",
-        description="Train PPO, in one file of plain PyTorch, and evaluate it over fresh episodes.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.ppo", "Train PPO, in one file of plain PyTorch, and evaluate it over fresh episodes.", EPILOG
     )
     p.add_argument("env", nargs="+", metavar="ENV", help="ids, module:ID, or FILE or FILE:Class of your own")
     p.add_argument("--seeds", type=int, default=1, metavar="N", help="how many, in turn (default 1)")

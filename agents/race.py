@@ -22,6 +22,7 @@ from agents.run import Run, UserError, check_env, known_name, reports_errors, te
 from lag_envs import store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
+from lag_envs.options import module_parser
 from lag_envs.scores import known_returns, score
 from lag_envs.tables import aligned
 
@@ -46,11 +47,8 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.race",
-        description="Train learners side by side, and report when each reaches which score.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.race", "Train learners side by side, and report when each reaches which score.", EPILOG
     )
     p.add_argument("env", nargs="?", default=ENV, metavar="ENV", help="default %(default)s")
     p.add_argument(

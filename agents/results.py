@@ -20,6 +20,7 @@ from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_e
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import installed_versions, machine
+from lag_envs.options import module_parser
 from lag_envs.scores import known_returns
 from lag_envs.store import write_file
 
@@ -50,12 +51,7 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.results",
-        description="Measure all agents, and write results, figures and page.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    p = module_parser("agents.results", "Measure all agents, and write results, figures and page.", EPILOG)
     p.add_argument("--envs", nargs="+", metavar="ENV", help="environments to measure (default: all)")
     p.add_argument("--agents", nargs="+", metavar="NAME", help="agents to measure (default: all)")
     p.add_argument("--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="default runs/")

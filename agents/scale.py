@@ -11,7 +11,6 @@ which plays with the seed that ended best.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import json
 import sys
@@ -32,6 +31,7 @@ from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 from lag_envs.tasks import resolve
 from lag_envs.tasks.measured import measured_entry as of_package
@@ -52,12 +52,7 @@ EPILOG = """examples:
 @reports_errors("agents.scale")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.scale",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    p = module_parser("agents.scale", __doc__, EPILOG)
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     p.add_argument("--batches", type=int, default=8, help="of episodes (default %(default)s)")
     p.add_argument(

@@ -27,6 +27,7 @@ from lag_envs.controllers import controllers
 from lag_envs.leaderboard.export import ExportError, export, find
 from lag_envs.leaderboard.protocol import LEARNED_POLICIES, boards
 from lag_envs.leaderboard.submission import Refused, Submission, load, write
+from lag_envs.options import module_parser
 
 Array = NDArray[np.float64]
 AUTHORS, LICENSE = ["the lag_envs authors"], "MIT"
@@ -157,18 +158,13 @@ def entrants(env_id: str, runs: Path, cache: Path) -> Iterator[tuple[str, Callab
 
 
 def folder_part(name: str) -> str:
-    """Return a name as part of a folder's."""
+    """Return a name in the form that folder names use."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.submit",
-        description="Make leaderboard submissions of all our agents.",
-        epilog=HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    p = module_parser("agents.submit", "Make leaderboard submissions of all our agents.", HELP)
     p.add_argument("out", metavar="OUT", type=Path, help="where to")
     p.add_argument("--envs", nargs="+", metavar="ENV", help="environments (default: all)")
     p.add_argument("--runs", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")

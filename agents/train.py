@@ -37,6 +37,7 @@ from agents.run import (
     terminable,
 )
 from lag_envs import TASKS, workers
+from lag_envs.options import module_parser
 from lag_envs.own_files import is_file
 from lag_envs.scores import score
 from lag_envs.store import write_file
@@ -70,11 +71,8 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.train",
-        description="Train a learner on an environment and evaluate it over fresh episodes.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.train", "Train a learner on an environment and evaluate it over fresh episodes.", EPILOG
     )
     p.add_argument(
         "env", nargs="+", metavar="ENV",
@@ -285,7 +283,7 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
 
 
 def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
-    """Return the next event, or ("end", name, reason), or None; write files that were told."""
+    """Return the next event, or ("end", name, reason), or None; write the files that events bring."""
     ended = next((future for future in futures if future.done()), None)
     try:
         event = events.get(timeout=0.05 if ended else 0.2)

@@ -26,6 +26,7 @@ from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import machine
+from lag_envs.options import module_parser
 from lag_envs.scores import score
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
@@ -189,11 +190,10 @@ def pace(data: Mapping[str, Any]) -> float:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.tune",
-        description="Tune numbers of controllers or settings of a learner, on seeds that no evaluation uses.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = module_parser(
+        "agents.tune",
+        "Tune numbers of controllers or settings of a learner, on seeds that no evaluation uses.",
+        EPILOG,
     )
     p.add_argument("env", metavar="ENV", help="id of an environment")
     p.add_argument("--only", metavar="NAME", help="tune this controller only")

@@ -15,6 +15,17 @@ import lag_envs  # noqa: F401
 from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
+#: Names and texts that a page must show as they are.
+HOSTILE = (
+    "</script><script>window.hacked = 1</script>",
+    "<img src=x onerror='window.hacked = 1'>",
+    '" onmouseover="window.hacked = 1" x=\'',
+    "{{ 7 * 7 }}{% raw %}${window.hacked = 1}`",
+    "<!--<script>\u2028\u2029\u202eevil\u0000",
+    "javascript:window.hacked=1",
+    "Ω" * 300,
+    "constructor",
+)
 AGENTS = (
     ("Value iteration, 81 nodes", "optimal", 1.0), ("iLQR", "controller", 0.996), ("PPO", "learned", 0.981),
     ("TQC", "learned", 0.978), ("SAC", "learned", 0.952), ("Energy pumping + LQR", "controller", 0.913),
@@ -126,6 +137,25 @@ def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.i
         for env_id in env_ids
     ]
     return {"protocol": 1, "made": "2026-11-21", "environments": boards, "combined": [COMBINED]}
+
+
+def hostile():
+    """Return a page's data in which every text is hostile."""
+    found = data(("PivotedBar-v0",), [(n, "learned", 0.9 - 0.1 * i) for i, n in enumerate(HOSTILE)])
+    for board in found["environments"]:
+        for row, text in zip(board["rows"], HOSTILE, strict=True):
+            row |= dict.fromkeys(("description", "license", "hardware", "code", "id"), text) | {
+                "authors": [text]
+            }
+            row["robustness"] = {text: 0.5}
+            row["replays"][0] = row["replays"][0] | {"label": text}
+        board["rows"][0]["kind"] = HOSTILE[2]
+        board["other"] = [{"id": t, "name": t, "state": "rejected", "reason": t} for t in HOSTILE]
+    return found
+
+
+def clean(text):
+    return text.replace("\0", "\ufffd")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Processes that work on a board at once, or are killed while doing so. Run by tests/test_board.py."""
+"""Processes that work on a board at once, or are killed while doing so. Run by tests/test_board_log.py."""
 
 import collections
 import json

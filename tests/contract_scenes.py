@@ -1,5 +1,7 @@
 """Scenes for tests, each with a feature that the package's own scenes lack."""
 
+import dataclasses
+
 import numpy as np
 
 from lag_envs.scenes.base import Scene, parameter
@@ -208,3 +210,26 @@ class Crane(Scene):
 
 
 ALL = (ChargedParticle, RotatingHoop, RotatingFrame, ElasticPendulum, Trolley, Functions, Top, Crane)
+
+
+def cart(decorate):
+    """Return a class of a cart on a spring, made with or without the decorator."""
+
+    class Cart(Scene):
+        mass: float = parameter(1.0, "kg", above=0.0)
+        spring: float = parameter(2.0, "N/m", least=0.0)
+        springs: int = 1
+        pair: tuple = dataclasses.field(default_factory=tuple)
+        coordinates = {"x": "m"}
+        controls = {"force": "N"}
+
+        def kinetic(self, q, v, xp):
+            return self.mass * v.x**2 / 2
+
+        def potential(self, q, xp):
+            return self.springs * self.spring * q.x**2 / 2
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.force}
+
+    return dataclasses.dataclass(frozen=True, kw_only=True)(Cart) if decorate else Cart

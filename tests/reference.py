@@ -12,6 +12,8 @@ from mpmath import mp, mpf
 from lag_envs import scenes
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report import reference
+from lag_envs.report.cases import Case
+from lag_envs.report.extremes import amplification
 from lag_envs.report.oracle import Oracle
 from lag_envs.report.stepped import Stepped
 
@@ -87,11 +89,6 @@ def _sizes(scene_name, params, state, control, dt):
 def conditioning(scene_name, params, state, control, dt, include_params=False):
     """Return by how much one rounding of the initial state is amplified in the final state.
 
-    Entry j of the state is moved up and down by 2**-53 times max(abs(entry), floor), where the
-    floor is 1 rad for angles (cos and sin are stored to absolute precision),
-    sqrt(hypot(alpha, beta)) for their rates, and 0 for the rest. The moves are of finite size: next to the
-    unstable equilibrium they count whole turns, where a derivative would give too much or too little.
-
     Parameters
     ----------
     scene_name, params, state, control, dt
@@ -102,44 +99,28 @@ def conditioning(scene_name, params, state, control, dt, include_params=False):
     Returns
     -------
     list of float
-        For each entry i of the final state, the sum over j of max abs(change of i) / 2**-53; a
-        stable computation is off by a small multiple of 2**-53 times that.
+        As `extremes.amplification`: a stable computation is off by a small multiple of 2**-53 times that.
     """
     digits, scene = 45, scene_of(scene_name, params)
-    state = [mpf(x) for x in state]
-    floors = {
-        "PivotedBar": (0, 0, 1, 1)[-len(state) :],
-        "Incline": (0, 0, 1),
-        "CylinderInCylinder": (1, 1, 0),
-    }[scene_name]
-    sizes = _sizes(scene_name, params, state, control, dt)
-    rate_floor = {"PivotedBar": len(state) - 1, "CylinderInCylinder": 1}.get(scene_name)
-    oracle = Oracle(scene)
-    base = reference.once(oracle, state, control, dt, digits)
-    total = [mpf(0)] * len(state)
+    total = amplification(Case(scene, tuple(state), control), dt)
+    if not include_params:
+        return total
+    base = reference.once(Oracle(scene), state, control, dt, digits)
 
     def count(*moved):
-        ends = [reference.once(*move, dt, digits) for move in moved]
+        ends = [reference.once(oracle, state, push, dt, digits) for oracle, push in moved]
         for i, centre in enumerate(base):
-            total[i] += max(abs(end[i] - centre) for end in ends) / EPS
+            total[i] += float(max(abs(end[i] - centre) for end in ends) / EPS)
 
     with mp.workdps(digits + 30):
-        for j, value in enumerate(state):
-            size = abs(value)
-            if floors[j]:
-                size = max(size, sizes[j] if j == rate_floor else 1)
-            if size:
-                moved = [[*state[:j], value + sign * EPS * size, *state[j + 1 :]] for sign in (1, -1)]
-                count(*((oracle, y, control) for y in moved))
-        if include_params:
-            for name in parameter_names(scene):
-                value = getattr(scene, name)
-                if value and value != inf:
-                    factors = (1 + Fraction(EPS), 1 - Fraction(EPS))
-                    count(*((Oracle(scene, {name: Fraction(value) * f}), state, control) for f in factors))
-            if control:
-                count(*((oracle, state, control * (1 + sign * mpf(EPS))) for sign in (1, -1)))
-    return [float(x) for x in total]
+        for name in parameter_names(scene):
+            value = getattr(scene, name)
+            if value and value != inf:
+                factors = (1 + Fraction(EPS), 1 - Fraction(EPS))
+                count(*((Oracle(scene, {name: Fraction(value) * f}), control) for f in factors))
+        if control:
+            count(*((Oracle(scene), control * (1 + sign * mpf(EPS))) for sign in (1, -1)))
+    return total
 
 
 # --- random cases ------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Eight systems for the tests of the series: energies as a scene states them, and hand-written equations.
+"""Eight systems for the tests of the series: scenes, half of them the package's, and hand-written equations.
 
 The equations give mass matrix and right-hand side in plain arithmetic and a few functions, so they run on
 floats, on mpmath's numbers and on series of python-flint. They use nothing of the package.
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lag_envs.report.oracle import solve_positive
+from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
 from lag_envs.scenes.base import Scene, parameter
 
 
@@ -23,16 +24,13 @@ class System(NamedTuple):
     drawn around ``centre``, ``push`` those of the controls.
     """
 
+    name: str
     scene: Scene
     motion: Callable
     places: tuple[float, ...]
     speeds: tuple[float, ...]
     push: tuple[float, ...] = ()
     centre: tuple[float, ...] = ()
-
-    @property
-    def name(self) -> str:
-        return type(self.scene).__name__
 
     @property
     def driven(self) -> bool:
@@ -47,33 +45,6 @@ class System(NamedTuple):
         return state, [part * push * generator.uniform(-1, 1) for push in self.push]
 
 
-class CartPole(Scene):
-    """A pole hinged on a cart that a force pushes."""
-
-    cart: float = parameter(1.0, "kg", above=0.0)
-    pole: float = parameter(0.1, "kg", above=0.0)
-    length: float = parameter(0.5, "m", above=0.0)
-    gravity: float = parameter(9.8, "m/s²", least=0.0)
-    friction: float = parameter(0.05, "N s/m", least=0.0)
-    coordinates = {"x": "m", "theta": "rad"}
-    controls = {"force": "N"}
-
-    def kinetic(self, q, v, xp):
-        across = v.x + self.length * v.theta * xp.cos(q.theta)
-        up = self.length * v.theta * xp.sin(q.theta)
-        turning = self.pole * self.length**2 / 3 * v.theta**2
-        return (self.cart * v.x**2 + self.pole * (across**2 + up**2) + turning) / 2
-
-    def potential(self, q, xp):
-        return self.pole * self.gravity * self.length * xp.cos(q.theta)
-
-    def dissipation(self, q, v, u, xp):
-        return 0.5 * self.friction * v.x**2
-
-    def applied(self, q, v, u, xp):
-        return {"x": u.force}
-
-
 def cart_pole(q, v, u, s, a, xp):
     m, length, c = 0.1, 0.5, xp.cos(q[1])
     mass = [[1.0 + m, m * length * c], [m * length * c, 4 * m * length**2 / xp.number(3)]]
@@ -81,42 +52,6 @@ def cart_pole(q, v, u, s, a, xp):
         u[0] - 0.05 * v[0] + m * length * v[1] * v[1] * xp.sin(q[1]),
         m * 9.8 * length * xp.sin(q[1]),
     ]
-
-
-class Acrobot(Scene):
-    """Two bars, the second angle relative to the first, a torque at the elbow, smooth dry friction."""
-
-    mass: float = parameter(0.8, "kg", above=0.0)
-    length: float = parameter(0.9, "m", above=0.0)
-    viscous: float = parameter(0.1, "N m s", least=0.0)
-    dry: float = parameter(0.2, "N m", least=0.0)
-    coordinates = {"shoulder": "rad", "elbow": "rad"}
-    controls = {"torque": "N m"}
-
-    def kinetic(self, q, v, xp):
-        m, half = self.mass, self.length / 2
-        inertia = m * self.length**2 / 12
-        both = v.shoulder + v.elbow
-        second = q.shoulder + q.elbow
-        across = 2 * half * v.shoulder * xp.cos(q.shoulder) + half * both * xp.cos(second)
-        up = 2 * half * v.shoulder * xp.sin(q.shoulder) + half * both * xp.sin(second)
-        return (
-            0.5 * (m * half**2 + inertia) * v.shoulder**2
-            + 0.5 * m * (across**2 + up**2)
-            + 0.5 * inertia * both**2
-        )
-
-    def potential(self, q, xp):
-        weight, half = 9.81 * self.mass, self.length / 2
-        return -weight * (3 * half * xp.cos(q.shoulder) + half * xp.cos(q.shoulder + q.elbow))
-
-    def dissipation(self, q, v, u, xp):
-        w = v.elbow
-        dry = w * xp.atan(100 * w) - xp.log(1 + 10_000 * w**2) / 200
-        return 0.5 * self.viscous * (v.shoulder**2 + w**2) + self.dry * dry
-
-    def applied(self, q, v, u, xp):
-        return {"elbow": u.torque}
 
 
 def acrobot(q, v, u, s, a, xp):
@@ -130,48 +65,6 @@ def acrobot(q, v, u, s, a, xp):
     force = half * sine * (both * both - v[0] * v[0]) - 3 * weight * xp.sin(q[0]) - lower - 0.1 * v[0]
     elbow = -half * sine * v[0] * v[0] - lower + u[0] - 0.1 * w - 0.2 * xp.atan(100 * w)
     return [[bar + m * length**2 + 2 * half * c + bar, mixed], [mixed, bar]], [force, elbow]
-
-
-class _Chain(Scene):
-    """Point masses on a support that is moved; absolute angles, friction in the joints."""
-
-    mass: float = parameter(0.1, "kg", above=0.0)
-    length: float = parameter(0.3, "m", above=0.0)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
-    friction: float = parameter(1e-4, "N m s", least=0.0)
-    bars: int = 2
-    prescribed = {"s": "m"}
-    controls = {"s_ddot": "m/s²"}
-
-    @property
-    def coordinates(self):
-        return {f"theta{i}": "rad" for i in range(1, self.bars + 1)}
-
-    def kinetic(self, q, v, xp):
-        across, up, total = v.s, 0.0, 0.0
-        for i in range(self.bars):
-            across = across + self.length * v[i] * xp.cos(q[i])
-            up = up + self.length * v[i] * xp.sin(q[i])
-            total = total + 0.5 * self.mass * (across**2 + up**2)
-        return total
-
-    def potential(self, q, xp):
-        weight = self.mass * self.gravity * self.length
-        return sum(-weight * (self.bars - i) * xp.cos(q[i]) for i in range(self.bars))
-
-    def dissipation(self, q, v, u, xp):
-        rates = [v[i] - (v[i - 1] if i else 0.0) for i in range(self.bars)]
-        return sum(0.5 * self.friction * rate**2 for rate in rates)
-
-
-class DoublePendulum(_Chain):
-    """Two of them."""
-
-
-class TriplePendulum(_Chain):
-    """Three of them."""
-
-    bars: int = 3
 
 
 def chain(q, v, u, s, a, xp):
@@ -193,41 +86,13 @@ def chain(q, v, u, s, a, xp):
     return mass, force
 
 
-class RotaryPendulum(Scene):
-    """A pendulum hinged on an arm that a torque turns in the plane (Furuta)."""
-
-    arm: float = parameter(0.2, "m", above=0.0)
-    length: float = parameter(0.15, "m", above=0.0)
-    mass: float = parameter(0.1, "kg", above=0.0)
-    inertia: float = parameter(2e-3, "kg m²", above=0.0)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
-    drag: float = parameter(1e-3, "N m s", least=0.0)
-    coordinates = {"phi": "rad", "theta": "rad"}
-    controls = {"torque": "N m"}
-
-    def kinetic(self, q, v, xp):
-        along = self.arm * v.phi + self.length * v.theta * xp.cos(q.theta)
-        out = self.length * v.phi * xp.sin(q.theta)
-        up = self.length * v.theta * xp.sin(q.theta)
-        return 0.5 * self.inertia * v.phi**2 + 0.5 * self.mass * (along**2 + out**2 + up**2)
-
-    def potential(self, q, xp):
-        return self.mass * self.gravity * self.length * xp.cos(q.theta)
-
-    def dissipation(self, q, v, u, xp):
-        return 0.5 * self.drag * v.phi**2
-
-    def applied(self, q, v, u, xp):
-        return {"phi": u.torque}
-
-
 def rotary(q, v, u, s, a, xp):
     m, r, length = xp.number(0.1), xp.number(0.2), xp.number(0.15)
     c, sine = xp.cos(q[1]), xp.sin(q[1])
     square = m * length**2
     mixed = m * r * length * c
     phi = u[0] - 1e-3 * v[0] - 2 * square * sine * c * v[0] * v[1] + m * r * length * sine * v[1] * v[1]
-    theta = square * sine * c * v[0] * v[0] + m * 9.81 * length * sine
+    theta = square * sine * c * v[0] * v[0] - m * 9.81 * length * sine
     return [[2e-3 + m * r**2 + square * sine * sine, mixed], [mixed, square + 0 * c]], [phi, theta]
 
 
@@ -319,15 +184,22 @@ def lattice(q, v, u, s, a, xp):
     ]
 
 
+POINTS = {"mass": 0.1, "length": 0.3, "com_distance": 0.3, "inertia": 0.0, "damping": 1e-4}
+ACROBOT = Acrobot(
+    mass_1=0.8, mass_2=0.8, length_1=0.9, length_2=0.9, damping=0.1, dry_friction=0.0, dry_friction_2=0.2
+)
+ROTARY = RotaryPendulum(
+    arm_length=0.2, arm_inertia=2e-3, mass=0.1, com_distance=0.15, inertia=0.0, arm_damping=1e-3
+)
 SYSTEMS = (
-    System(CartPole(), cart_pole, (2.0, 3.1), (3.0, 12.0), (10.0,)),
-    System(Acrobot(), acrobot, (3.1, 3.1), (6.0, 8.0), (2.0,)),
-    System(DoublePendulum(), chain, (3.1, 3.1), (10.0, 10.0), (15.0,)),
-    System(TriplePendulum(), chain, (3.1, 3.1, 3.1), (8.0, 8.0, 8.0), (15.0,)),
-    System(RotaryPendulum(), rotary, (3.1, 3.1), (10.0, 10.0), (0.1,)),
-    System(ElasticPendulum(), elastic, (0.35, 0.35), (3.0, 3.0), (15.0,), (0.3, -0.3)),
-    System(TurningFrame(), turning, (0.5, 0.5), (4.0, 4.0), (3.0, 3.0)),
-    System(Lattice(), lattice, (1.0, 1.0), (4.0, 4.0), (5.0,)),
+    System("cart-pole", CartPole(friction=0.05), cart_pole, (2.0, 3.1), (3.0, 12.0), (10.0,)),
+    System("acrobot", ACROBOT, acrobot, (3.1, 3.1), (6.0, 8.0), (2.0,)),
+    System("double pendulum", Chain(bars=2, **POINTS), chain, (3.1, 3.1), (10.0, 10.0), (15.0,)),
+    System("triple pendulum", Chain(bars=3, **POINTS), chain, (3.1, 3.1, 3.1), (8.0, 8.0, 8.0), (15.0,)),
+    System("rotary pendulum", ROTARY, rotary, (3.1, 3.1), (10.0, 10.0), (0.1,)),
+    System("elastic pendulum", ElasticPendulum(), elastic, (0.35, 0.35), (3.0, 3.0), (15.0,), (0.3, -0.3)),
+    System("turning frame", TurningFrame(), turning, (0.5, 0.5), (4.0, 4.0), (3.0, 3.0)),
+    System("lattice", Lattice(), lattice, (1.0, 1.0), (4.0, 4.0), (5.0,)),
 )
 
 

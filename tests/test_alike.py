@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_submission import (
+from small_submissions import (
     ABOUT,
     FEEDBACK,
     GRID,
@@ -243,7 +243,7 @@ def test_returns_count_too(tmp_path):
     assert likeness(other, first, 1e6).closeness < 1.0
 
 
-def test_who_fails_is_like_nobody(tmp_path):
+def test_a_policy_that_fails_acts_like_no_other(tmp_path):
     numbers = {"weight_0": np.full((3, 4), 1e308), "bias_0": np.zeros(3)}
     numbers |= {"weight_1": np.array([[1e308, -1e308, 0.0]])}
     arrays = {s: numbers | {"bias_1": np.full(1, float(s))} for s in range(5)}

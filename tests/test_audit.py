@@ -305,7 +305,7 @@ def test_a_submission_is_changed_after_verification(board, how):
     else:
         shutil.rmtree(folder)
         shutil.copytree(board.submission(entry_of(board, "clone").id), folder)
-    if how != "a link":  # the real `load` refuses it, see tests/test_submission.py
+    if how != "a link":  # the real `load` refuses it, see tests/test_hostile_submissions.py
         assert f"line {entry.line}: {folder} is not what was added" in refused(board)
         assert "submissions" in wrong(board)
 
@@ -348,7 +348,7 @@ def test_name_and_files_and_digest_are_edited(board):
 
 
 @needs_git
-def test_a_nonce_that_was_known_before(board):
+def test_a_nonce_that_was_known_before_the_submission(board):
     """Something is added and verified with the hash of a commit that was already there."""
     value = commit(board)
     board.add(fake_submissions.load(write(board.folder.parent / "late", "late")))
@@ -360,7 +360,7 @@ def test_a_nonce_that_was_known_before(board):
 
 
 @needs_git
-def test_a_nonce_of_a_commit_that_is_not_there(board):
+def test_a_nonce_of_a_missing_commit(board):
     board.publish("ab" * 20, "commit")
     commit(board)
     assert "is no commit in the history" in wrong(board)["nonces"][0]
@@ -403,7 +403,7 @@ def test_the_commit_that_is_the_nonce_must_hold_the_board(board):
 
 
 @needs_git
-def test_a_tag_is_held_against_too(board):
+def test_history_before_a_tag_is_checked_too(board):
     folder = board.folder.parent
     git(folder, "tag", "v1")
     git(folder, "checkout", "--quiet", "--orphan", "clean")  # a rewritten history
@@ -425,7 +425,7 @@ def test_an_older_checkout_is_no_forgery(board):
 
 
 @needs_git
-def test_boards_that_were_begun_again_before_there_was_a_chain(board):
+def test_boards_that_were_started_over_before_logs_had_a_chain(board):
     """As in the repository itself: that does not help anybody who begins again later."""
     folder = board.folder.parent
     shutil.rmtree(folder / ".git")
@@ -436,7 +436,7 @@ def test_boards_that_were_begun_again_before_there_was_a_chain(board):
     board.log.write_bytes(whole)
     commit(board)
     found = audit.cheap(board)
-    assert "1 are of boards that were begun again" in found.findings[2].told and not refused(board)
+    assert "1 belong to boards that were started over" in found.findings[2].told and not refused(board)
 
 
 def test_without_a_repository(board):
@@ -473,7 +473,7 @@ def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"board": 1}', "[" * 10**5])
-def test_a_pin_that_is_none(board, tmp_path, monkeypatch, content):
+def test_a_bad_pin_is_refused(board, tmp_path, monkeypatch, content):
     monkeypatch.setattr(audit, "PIN", tmp_path / "pin.json")
     audit.PIN.write_text(content)
     assert "is no pin" in refused(board)

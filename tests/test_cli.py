@@ -85,13 +85,14 @@ def modules():
     for folder in ("agents", "src/lag_envs", "tools"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
-            if "ArgumentParser(" in text and '\nif __name__ == "__main__":' in text and path.stem != "cli":
+            parses = re.search(r"(ArgumentParser|module_parser|take_none)\(", text)
+            if parses and '\nif __name__ == "__main__":' in text and path.stem != "cli":
                 yield ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("src.")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module", list(modules()))
-def test_so_has_every_module_that_is_run(module, capsys):
+def test_every_module_that_is_run_has_help_with_examples(module, capsys):
     try:
         importlib.import_module(module).main(["--help"])
     except SystemExit as end:

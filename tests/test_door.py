@@ -5,6 +5,7 @@ import math
 import random
 import re
 import weakref
+from functools import partial
 
 import numpy as np
 import pytest
@@ -41,246 +42,130 @@ class Good(Scene):
         return {"x": u.force}
 
 
+def changed(**attributes):
+    """Return a class with other attributes."""
+    return type("Bad", (Good,), attributes | {"__module__": __name__})
+
+
+#: Functions that make a class that must be refused, and what its error says.
 MISTAKES = []
 
 
-def mistake(formula, *words):
-    """Add a class, made by a function, to those that must be refused.
-
-    Parameters
-    ----------
-    formula : str
-        The name in the error, after the class's name.
-    words : str
-        Further text in the error.
-    """
+def mistake(*words):
+    """Add a function to these."""
 
     def add(make):
-        MISTAKES.append(pytest.param(make, formula, words, id=make.__name__))
+        MISTAKES.append(pytest.param(make, words, id=make.__name__))
         return make
 
     return add
 
 
-def changed(name, method):
-    """Return a class that differs in one method."""
-    return type("Bad", (Good,), {name: method, "__module__": __name__})
-
-
-def potential(formula):
-    return changed("potential", lambda self, q, xp: formula(self, q, xp))
-
-
-def kinetic(formula):
-    return changed("kinetic", lambda self, q, v, xp: formula(self, q, v, xp))
-
-
 # --- numbers that cannot be traced -------------------------------------------------------------------------
 
-
-@mistake("potential", "math", "functions of xp")
-def math_function_of_a_coordinate():
-    return potential(lambda self, q, xp: math.sin(q.x))
-
-
-@mistake("potential", "math", "functions of xp")
-def math_function_of_a_parameter():
-    return potential(lambda self, q, xp: math.sqrt(self.mass) * q.x**2)
-
-
-@mistake("potential", "math", "functions of xp")
-def math_function_of_a_parameter_that_is_zero():
-    return potential(lambda self, q, xp: math.sqrt(self.friction) + q.x**2)
-
-
-@mistake("potential", "np.sin", "xp.sin")
-def numpy_function():
-    return potential(lambda self, q, xp: np.sin(q.x))
-
-
-@mistake("potential", "sin", "functions of xp")
-def numpy_function_of_an_array_of_numbers():
-    return potential(lambda self, q, xp: np.sin(np.array([q.x, q.y])).sum())
-
-
-@mistake("potential", "float()")
-def float_of_a_number():
-    return potential(lambda self, q, xp: float(q.x) ** 2)
-
-
-@mistake("potential", "the number inf")
-def number_beyond_floats():
-    return potential(lambda self, q, xp: 10**400 * q.x)
-
-
-@mistake("potential", "int()", "smooth")
-def int_of_a_number():
-    return potential(lambda self, q, xp: int(q.x) * q.x)
-
-
-@mistake("potential", "%", "smooth")
-def remainder():
-    return potential(lambda self, q, xp: (q.x % 1.0) ** 2)
-
-
-@mistake("potential", "%", "smooth")
-def floor_division():
-    return potential(lambda self, q, xp: (q.x // 1.0) ** 2)
-
-
-@mistake("potential", "max", "branch")
-def largest():
-    return potential(lambda self, q, xp: max(q.x, 0.0) ** 2)
-
-
-@mistake("potential", "comparison", "branch")
-def less_than():
-    return potential(lambda self, q, xp: q.x**2 if q.x < 0.0 else 0.0)
-
-
-@mistake("potential", "comparison", "branch")
-def equal():
-    return potential(lambda self, q, xp: q.x**2 if self.spring == 0.0 else 0.0)
-
-
-@mistake("potential", "comparison")
-def is_in():
-    return potential(lambda self, q, xp: q.x**2 if self.spring in (0.0, 1.0) else 0.0)
-
-
-@mistake("potential", "`in`")
-def is_among_the_coordinates():
-    return potential(lambda self, q, xp: q.x**2 if self.spring in q else 0.0)
-
-
-@mistake("potential", "`if`", "branch")
-def truth():
-    return potential(lambda self, q, xp: q.x**2 if self.friction else 0.0)
-
-
-@mistake("potential", "`if`")
-def logic():
-    return potential(lambda self, q, xp: self.friction or q.x**2)
-
-
-@mistake("potential", "xp.where", "smooth")
-def where():
-    return potential(lambda self, q, xp: xp.where(True, q.x, 0.0))
-
-
-@mistake("potential", "abs()", "xp.sqrt(x * x + eps * eps)")
-def absolute_value():
-    return potential(lambda self, q, xp: abs(q.x))
-
-
-@mistake("potential", "xp.abs", "smooth")
-def absolute_value_by_xp():
-    return potential(lambda self, q, xp: xp.abs(q.x))
-
-
-@mistake("potential", "absolute value", "eps")
-def absolute_value_by_a_root():
-    return potential(lambda self, q, xp: xp.sqrt(q.x**2))
-
-
-@mistake("dissipation", "xp.sign", "smooth")
-def coulomb_friction():
-    return changed("dissipation", lambda self, q, v, u, xp: self.mass * v.x * xp.sign(v.x))
-
-
-@mistake("dissipation", "absolute value")
-def coulomb_friction_by_a_power():
-    return changed("dissipation", lambda self, q, v, u, xp: self.mass * (v.x * v.x) ** 0.5)
-
-
-@mistake("dissipation", "absolute value")
-def coulomb_friction_on_a_belt():
-    return changed("dissipation", lambda self, q, v, u, xp: self.mass * xp.sqrt((v.x - v.s - 0.25) ** 2))
-
-
-@mistake("potential", "xp.erf", "xp.sin, cos")
-def unknown_function():
-    return potential(lambda self, q, xp: xp.erf(q.x))
-
-
-@mistake("potential", "power", "xp.exp(p * xp.log(x))")
-def fractional_power():
-    return potential(lambda self, q, xp: q.x**1.5)
-
-
-@mistake("potential", "power")
-def recorded_power():
-    return potential(lambda self, q, xp: q.x**self.spring)
-
-
-@mistake("potential", "power", "xp.exp")
-def recorded_exponent():
-    return potential(lambda self, q, xp: 2.0**q.x)
-
-
-@mistake("potential", "index or range", "structural")
-def count_by_a_parameter():
-    return potential(lambda self, q, xp: sum(q.x**2 for _ in range(self.spring)))
-
-
-@mistake("potential", "round()")
-def rounded():
-    return potential(lambda self, q, xp: round(q.x) ** 2)
-
-
-@mistake("potential", "real")
-def complex_number():
-    return potential(lambda self, q, xp: q.x * 1j)
-
-
-@mistake("potential", "complex")
-def complex_result():
-    return potential(lambda self, q, xp: 1.0 + 2.0j)
-
-
-@mistake("potential", "None", "return")
-def no_result():
-    return potential(lambda self, q, xp: None)
-
-
-@mistake("potential", "ndarray", "one number")
-def array():
-    return potential(lambda self, q, xp: np.array([q.x, q.y]) ** 2)
-
-
-@mistake("kinetic", "tuple", "one number")
-def several_results():
-    return kinetic(lambda self, q, v, xp: (v.x**2, v.y**2))
-
-
-@mistake("potential", "'text'")
-def text():
-    return potential(lambda self, q, xp: q.x + "text")
-
-
-@mistake("potential", "nan")
-def not_a_number():
-    return potential(lambda self, q, xp: q.x * math.nan)
-
-
-@mistake("potential", "inf")
-def infinity():
-    return potential(lambda self, q, xp: q.x * math.inf)
-
-
-@mistake("potential", "divides by zero", "friction=0")
-def division_by_a_parameter_that_is_zero():
-    return potential(lambda self, q, xp: q.x**2 / self.friction)
-
-
-@mistake("potential", "log", "0")
-def logarithm_of_nothing():
-    return potential(lambda self, q, xp: xp.log(0.0) + q.x)
-
-
-@mistake("potential", "NameError", "sin")
-def function_without_xp():
-    return potential(lambda self, q, xp: sin(q.x))  # noqa: F821
+UNTRACEABLE = {
+    "math function of a coordinate": (
+        {"potential": lambda self, q, xp: math.sin(q.x)},
+        "potential; math; functions of xp",
+    ),
+    "math function of a parameter": (
+        {"potential": lambda self, q, xp: math.sqrt(self.mass) * q.x**2},
+        "potential; math; functions of xp",
+    ),
+    "math function of a parameter that is zero": (
+        {"potential": lambda self, q, xp: math.sqrt(self.friction) + q.x**2},
+        "potential; math; functions of xp",
+    ),
+    "numpy function": ({"potential": lambda self, q, xp: np.sin(q.x)}, "potential; np.sin; xp.sin"),
+    "numpy function of an array of numbers": (
+        {"potential": lambda self, q, xp: np.sin(np.array([q.x, q.y])).sum()},
+        "potential; sin; functions of xp",
+    ),
+    "float of a number": ({"potential": lambda self, q, xp: float(q.x) ** 2}, "potential; float()"),
+    "number beyond floats": ({"potential": lambda self, q, xp: 10**400 * q.x}, "potential; the number inf"),
+    "int of a number": ({"potential": lambda self, q, xp: int(q.x) * q.x}, "potential; int(); smooth"),
+    "remainder": ({"potential": lambda self, q, xp: (q.x % 1.0) ** 2}, "potential; %; smooth"),
+    "floor division": ({"potential": lambda self, q, xp: (q.x // 1.0) ** 2}, "potential; %; smooth"),
+    "largest": ({"potential": lambda self, q, xp: max(q.x, 0.0) ** 2}, "potential; max; branch"),
+    "less than": (
+        {"potential": lambda self, q, xp: q.x**2 if q.x < 0.0 else 0.0},
+        "potential; comparison; branch",
+    ),
+    "equal": (
+        {"potential": lambda self, q, xp: q.x**2 if self.spring == 0.0 else 0.0},
+        "potential; comparison; branch",
+    ),
+    "is in": (
+        {"potential": lambda self, q, xp: q.x**2 if self.spring in (0.0, 1.0) else 0.0},
+        "potential; comparison",
+    ),
+    "is among the coordinates": (
+        {"potential": lambda self, q, xp: q.x**2 if self.spring in q else 0.0},
+        "potential; `in`",
+    ),
+    "truth": ({"potential": lambda self, q, xp: q.x**2 if self.friction else 0.0}, "potential; `if`; branch"),
+    "logic": ({"potential": lambda self, q, xp: self.friction or q.x**2}, "potential; `if`"),
+    "where": ({"potential": lambda self, q, xp: xp.where(True, q.x, 0.0)}, "potential; xp.where; smooth"),
+    "absolute value": (
+        {"potential": lambda self, q, xp: abs(q.x)},
+        "potential; abs(); xp.sqrt(x * x + eps * eps)",
+    ),
+    "absolute value by xp": ({"potential": lambda self, q, xp: xp.abs(q.x)}, "potential; xp.abs; smooth"),
+    "absolute value by a root": (
+        {"potential": lambda self, q, xp: xp.sqrt(q.x**2)},
+        "potential; absolute value; eps",
+    ),
+    "coulomb friction": (
+        {"dissipation": lambda self, q, v, u, xp: self.mass * v.x * xp.sign(v.x)},
+        "dissipation; xp.sign; smooth",
+    ),
+    "coulomb friction by a power": (
+        {"dissipation": lambda self, q, v, u, xp: self.mass * (v.x * v.x) ** 0.5},
+        "dissipation; absolute value",
+    ),
+    "coulomb friction on a belt": (
+        {"dissipation": lambda self, q, v, u, xp: self.mass * xp.sqrt((v.x - v.s - 0.25) ** 2)},
+        "dissipation; absolute value",
+    ),
+    "unknown function": ({"potential": lambda self, q, xp: xp.erf(q.x)}, "potential; xp.erf; xp.sin, cos"),
+    "fractional power": (
+        {"potential": lambda self, q, xp: q.x**1.5},
+        "potential; power; xp.exp(p * xp.log(x))",
+    ),
+    "recorded power": ({"potential": lambda self, q, xp: q.x**self.spring}, "potential; power"),
+    "recorded exponent": ({"potential": lambda self, q, xp: 2.0**q.x}, "potential; power; xp.exp"),
+    "count by a parameter": (
+        {"potential": lambda self, q, xp: sum(q.x**2 for _ in range(self.spring))},
+        "potential; index or range; structural",
+    ),
+    "rounded": ({"potential": lambda self, q, xp: round(q.x) ** 2}, "potential; round()"),
+    "complex number": ({"potential": lambda self, q, xp: q.x * 1j}, "potential; real"),
+    "complex result": ({"potential": lambda self, q, xp: 1.0 + 2.0j}, "potential; complex"),
+    "no result": ({"potential": lambda self, q, xp: None}, "potential; None; return"),
+    "array": ({"potential": lambda self, q, xp: np.array([q.x, q.y]) ** 2}, "potential; ndarray; one number"),
+    "several results": ({"kinetic": lambda self, q, v, xp: (v.x**2, v.y**2)}, "kinetic; tuple; one number"),
+    "text": ({"potential": lambda self, q, xp: q.x + "text"}, "potential; 'text'"),
+    "not a number": ({"potential": lambda self, q, xp: q.x * math.nan}, "potential; nan"),
+    "infinity": ({"potential": lambda self, q, xp: q.x * math.inf}, "potential; inf"),
+    "division by a parameter that is zero": (
+        {"potential": lambda self, q, xp: q.x**2 / self.friction},
+        "potential; divides by zero; friction=0",
+    ),
+    "logarithm of nothing": ({"potential": lambda self, q, xp: xp.log(0.0) + q.x}, "potential; log; 0"),
+    "function without xp": ({"potential": lambda self, q, xp: sin(q.x)}, "potential; NameError; sin"),  # noqa: F821
+    "unknown coordinate": ({"potential": lambda self, q, xp: q.z**2}, "potential; 'z'; x, y, s, rise"),
+    "index too large": ({"potential": lambda self, q, xp: q[7] ** 2}, "potential; number 7"),
+    "unknown control": (
+        {"applied": lambda self, q, v, u, xp: {"x": u.force + u.push}},
+        "applied; 'push'; force",
+    ),
+    "unknown parameter": ({"potential": lambda self, q, xp: self.width * q.x**2}, "potential; 'width'"),
+    "derived from itself": (
+        {"potential": lambda self, q, xp: self.energy([0.0] * 6)["total"]},
+        "potential; derived",
+    ),
+    "chance": ({"potential": lambda self, q, xp: random.random() * q.x**2}, "formula; again; chance"),
+}
 
 
 @mistake("potential", "self", "spring")
@@ -289,7 +174,7 @@ def assignment_to_self():
         self.spring = 3.0
         return self.spring * q.x**2
 
-    return changed("potential", formula)
+    return changed(potential=formula)
 
 
 @mistake("potential", "sets", "read")
@@ -298,173 +183,143 @@ def assignment_to_a_coordinate():
         q.x = 0.0
         return q.x**2
 
-    return changed("potential", formula)
-
-
-@mistake("potential", "'z'", "x, y, s, rise")
-def unknown_coordinate():
-    return potential(lambda self, q, xp: q.z**2)
-
-
-@mistake("potential", "number 7")
-def index_too_large():
-    return potential(lambda self, q, xp: q[7] ** 2)
-
-
-@mistake("applied", "'push'", "force")
-def unknown_control():
-    return changed("applied", lambda self, q, v, u, xp: {"x": u.force + u.push})
-
-
-@mistake("potential", "'width'")
-def unknown_parameter():
-    return potential(lambda self, q, xp: self.width * q.x**2)
-
-
-@mistake("potential", "derived")
-def derived_from_itself():
-    return potential(lambda self, q, xp: self.energy([0.0] * 6)["total"])
-
-
-@mistake("formula", "again", "chance")
-def chance():
-    return potential(lambda self, q, xp: random.random() * q.x**2)
+    return changed(potential=formula)
 
 
 # --- invalid energies --------------------------------------------------------------------------------------
 
-
-@mistake("kinetic", "degree 4", "two at most")
-def fourth_power_of_a_sum():
-    return kinetic(lambda self, q, v, xp: v.x**2 + v.y**2 + (v.x - v.y) ** 4)
-
-
-@mistake("kinetic", "degree 3", "two at most")
-def third_degree():
-    return kinetic(lambda self, q, v, xp: v.x**2 + v.y**2 + v.x**3)
-
-
-@mistake("kinetic", "degree 4", "two at most")
-def relativity_in_two_terms():
-    return kinetic(lambda self, q, v, xp: (v.x**2 + v.y**2) / 2 + 3 * v.x**4 / 8)
-
-
-@mistake("kinetic", "function or denominator", "sqrt")
-def velocity_in_a_function():
-    return kinetic(lambda self, q, v, xp: xp.sqrt(1 + v.x**2) + v.y**2)
-
-
-@mistake("kinetic", "function or denominator")
-def velocity_in_a_denominator():
-    return kinetic(lambda self, q, v, xp: v.x**2 + v.y**2 + 1 / (1 + v.x))
-
-
-@mistake("kinetic", "'y'", "mass")
-def coordinate_without_mass():
-    return kinetic(lambda self, q, v, xp: v.x**2 / 2)
-
-
-@mistake("kinetic", "'x'", "mass")
-def energy_without_velocities():
-    return kinetic(lambda self, q, v, xp: q.x**2 / 2 + q.y**2)
-
-
-@mistake("kinetic", "singular", "x, y")
-def singular_mass():
-    return kinetic(lambda self, q, v, xp: (v.x + v.y) ** 2 / 2)
-
-
-@mistake("kinetic", "singular")
-def singular_mass_everywhere_by_angles():
-    return kinetic(lambda self, q, v, xp: (v.x * xp.cos(q.x) + v.y * xp.sin(q.x)) ** 2 / 2)
-
-
-@mistake("kinetic", "not positive")
-def negative_mass():
-    return kinetic(lambda self, q, v, xp: v.x**2 / 2 - v.y**2 / 2)
-
-
-@mistake("potential", "(self, q, xp)", "(self, q, v, xp)")
-def velocity_in_the_potential():
-    return changed("potential", lambda self, q, v, xp: q.x**2 + v.x)
-
-
-@mistake("potential", "(self, q, xp)", "time")
-def explicit_time():
-    return changed("potential", lambda self, q, t, xp: q.x**2 * xp.cos(t))
+INVALID = {
+    "fourth power of a sum": (
+        {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + (v.x - v.y) ** 4},
+        "kinetic; degree 4; two at most",
+    ),
+    "third degree": (
+        {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + v.x**3},
+        "kinetic; degree 3; two at most",
+    ),
+    "relativity in two terms": (
+        {"kinetic": lambda self, q, v, xp: (v.x**2 + v.y**2) / 2 + 3 * v.x**4 / 8},
+        "kinetic; degree 4; two at most",
+    ),
+    "velocity in a function": (
+        {"kinetic": lambda self, q, v, xp: xp.sqrt(1 + v.x**2) + v.y**2},
+        "kinetic; function or denominator; sqrt",
+    ),
+    "velocity in a denominator": (
+        {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + 1 / (1 + v.x)},
+        "kinetic; function or denominator",
+    ),
+    "coordinate without mass": ({"kinetic": lambda self, q, v, xp: v.x**2 / 2}, "kinetic; 'y'; mass"),
+    "energy without velocities": (
+        {"kinetic": lambda self, q, v, xp: q.x**2 / 2 + q.y**2},
+        "kinetic; 'x'; mass",
+    ),
+    "singular mass": ({"kinetic": lambda self, q, v, xp: (v.x + v.y) ** 2 / 2}, "kinetic; singular; x, y"),
+    "singular mass everywhere by angles": (
+        {"kinetic": lambda self, q, v, xp: (v.x * xp.cos(q.x) + v.y * xp.sin(q.x)) ** 2 / 2},
+        "kinetic; singular",
+    ),
+    "negative mass": ({"kinetic": lambda self, q, v, xp: v.x**2 / 2 - v.y**2 / 2}, "kinetic; not positive"),
+    "velocity in the potential": (
+        {"potential": lambda self, q, v, xp: q.x**2 + v.x},
+        "potential; (self, q, xp); (self, q, v, xp)",
+    ),
+    "explicit time": (
+        {"potential": lambda self, q, t, xp: q.x**2 * xp.cos(t)},
+        "potential; (self, q, xp); time",
+    ),
+    "signature of version 0.1": (
+        {"dissipation": lambda self, v, u: v.x**2},
+        "dissipation; (self, q, v, u, xp)",
+    ),
+    "forces without names": ({"applied": lambda self, q, v, u, xp: [u.force, 0.0]}, "applied; by coordinate"),
+    "force on an unknown coordinate": (
+        {"applied": lambda self, q, v, u, xp: {"theta": u.force}},
+        "applied; 'theta'; x, y",
+    ),
+    "force that is none": (
+        {"applied": lambda self, q, v, u, xp: {"x": u.force if self.links > 3 else None}},
+        "applied; None; 'x'",
+    ),
+    "rest of a free coordinate": ({"rests": lambda self: {"x": 1.0}}, "rests; 'x'; prescribed"),
+    "pose without an angle": (
+        {"poses": lambda self, q, xp: {"cart": (q.x, q.y)}},
+        "poses; 'cart'; (x, y, angle)",
+    ),
+    "body without a pose": ({"bodies": lambda self: {"wheel": []}}, "bodies; 'wheel'; poses"),
+    "body that is no shape": (
+        {"bodies": lambda self: {"ground": ["cart"]}},
+        "bodies; 'ground'; Line, Polygon, Circle; 'cart'",
+    ),
+    "body that is one shape": (
+        {"bodies": lambda self: {"ground": Circle((0.0, 0.0), 1.0)}},
+        "bodies; a list of shapes; 'ground'",
+    ),
+    "indicator without a place": (
+        {"indicators": lambda self, now, xp: {"arrow": now.q.x}},
+        "indicators; 'arrow'; (x, y, angle, part)",
+    ),
+    "indicators without names": (
+        {"indicators": lambda self, now, xp: [(now.q.x, 0.0)]},
+        "indicators; by frame",
+    ),
+    "indicator at an unknown coordinate": (
+        {"indicators": lambda self, now, xp: {"arrow": (now.q.z, 0.0)}},
+        "indicators; 'z'; x, y",
+    ),
+    "shapes per moment": (
+        {"shapes": lambda self, now: []},
+        "shapes; bodies(self); poses(self, q, xp); indicators(self, now, xp)",
+    ),
+}
 
 
 @mistake("kinetic", "kinetic(self, q, v, xp)", "method")
 def formula_that_is_no_method():
-    return changed("kinetic", 1.0)
-
-
-@mistake("dissipation", "(self, q, v, u, xp)")
-def signature_of_version_0_1():
-    return changed("dissipation", lambda self, v, u: v.x**2)
-
-
-@mistake("applied", "by coordinate")
-def forces_without_names():
-    return changed("applied", lambda self, q, v, u, xp: [u.force, 0.0])
-
-
-@mistake("applied", "'theta'", "x, y")
-def force_on_an_unknown_coordinate():
-    return changed("applied", lambda self, q, v, u, xp: {"theta": u.force})
-
-
-@mistake("applied", "None", "'x'")
-def force_that_is_none():
-    return changed("applied", lambda self, q, v, u, xp: {"x": u.force if self.links > 3 else None})
-
-
-@mistake("rests", "'x'", "prescribed")
-def rest_of_a_free_coordinate():
-    return changed("rests", lambda self: {"x": 1.0})
-
-
-@mistake("poses", "'cart'", "(x, y, angle)")
-def pose_without_an_angle():
-    return changed("poses", lambda self, q, xp: {"cart": (q.x, q.y)})
-
-
-@mistake("bodies", "'wheel'", "poses")
-def body_without_a_pose():
-    return changed("bodies", lambda self: {"wheel": []})
-
-
-@mistake("bodies", "'ground'", "Line, Polygon, Circle", "'cart'")
-def body_that_is_no_shape():
-    return changed("bodies", lambda self: {"ground": ["cart"]})
-
-
-@mistake("bodies", "a list of shapes", "'ground'")
-def body_that_is_one_shape():
-    return changed("bodies", lambda self: {"ground": Circle((0.0, 0.0), 1.0)})
-
-
-@mistake("indicators", "'arrow'", "(x, y, angle, part)")
-def indicator_without_a_place():
-    return changed("indicators", lambda self, now, xp: {"arrow": now.q.x})
-
-
-@mistake("indicators", "by frame")
-def indicators_without_names():
-    return changed("indicators", lambda self, now, xp: [(now.q.x, 0.0)])
-
-
-@mistake("indicators", "'z'", "x, y")
-def indicator_at_an_unknown_coordinate():
-    return changed("indicators", lambda self, now, xp: {"arrow": (now.q.z, 0.0)})
-
-
-@mistake("shapes", "bodies(self)", "poses(self, q, xp)", "indicators(self, now, xp)")
-def shapes_per_moment():
-    return changed("shapes", lambda self, now: [])
+    return changed(kinetic=1.0)
 
 
 # --- names -------------------------------------------------------------------------------------------------
+
+DECLARED = {
+    "coordinates without units": ({"coordinates": ("x", "y")}, 'coordinates; {"x": "m"}'),
+    "unit that is no text": ({"coordinates": {"x": "m", "y": 1.0}}, "coordinates; unit of 'y'"),
+    "keyword": ({"coordinates": {"x": "m", "lambda": "m"}}, "coordinates; 'lambda'; keyword"),
+    "name with a blank": ({"coordinates": {"x": "m", "x 1": "m"}}, "coordinates; 'x 1'"),
+    "name with an underscore first": ({"coordinates": {"x": "m", "_x": "m"}}, "coordinates; '_x'"),
+    "coordinate beside its rate": (
+        {"coordinates": {"x": "m", "y": "m", "x_dot": "m/s"}},
+        "'x_dot'; derivative of 'x'",
+    ),
+    "coordinate free and prescribed": (
+        {"prescribed": {"s": "m", "rise": "m", "x": "m"}},
+        "'x'; free and prescribed",
+    ),
+    "control of a free coordinate": ({"controls": {"x_ddot": "m/s²"}}, "'x_ddot'; applied"),
+    "two controls of one coordinate": (
+        {"controls": {"force": "N", "s_ddot": "m/s²", "s_dot": "m/s"}},
+        "'s_ddot'; 's_dot'; both",
+    ),
+    "control that is not used": (
+        {"controls": {"force": "N", "motor": "N"}},
+        "'motor'; has no effect; u.motor",
+    ),
+    "method of every scene": ({"power": lambda self: 1.0}, "power; another"),
+    "state that lacks a name": ({"state": ("x", "x_dot", "y", "y_dot")}, "state; order of"),
+    "state that is text": ({"state": "x"}, "state; names in order"),
+    "rate left out without its place": ({"left_out": ("s_dot",)}, "left_out; 's'; 's_dot'"),
+    "left out that is not there": ({"left_out": ("z",)}, "left_out; 'z'"),
+    "rate of a free coordinate left out": ({"left_out": ("x", "x_dot")}, "left_out; 'x_dot'; free"),
+    "left out free place that is needed": ({"left_out": ("x",)}, "left_out; depends on 'x'"),
+    "reaction on what is not prescribed": (
+        {"reactions": {"support": "rise", "push": "s", "wall": "x"}},
+        "reactions; 'wall'; prescribed",
+    ),
+    "ratio of unknown forces": ({"ratios": {"needed": ("push", "normal")}}, "ratios; 'normal'; reactions"),
+    "ratio of one force": ({"ratios": {"needed": "push"}}, "ratios; pair"),
+    "controls and modes": ({"modes": {"pushed": {"force": "N"}}}, "controls and modes"),
+    "mode that is no dict": ({"controls": {}, "modes": {"pushed": "force"}}, "modes; 'pushed'"),
+}
 
 
 @mistake("kinetic", "not defined")
@@ -501,22 +356,6 @@ def no_coordinates():
     return Bad
 
 
-@mistake("coordinates", '{"x": "m"}')
-def coordinates_without_units():
-    class Bad(Good):
-        coordinates = ("x", "y")
-
-    return Bad
-
-
-@mistake("coordinates", "unit of 'y'")
-def unit_that_is_no_text():
-    class Bad(Good):
-        coordinates = {"x": "m", "y": 1.0}
-
-    return Bad
-
-
 @mistake("coordinates", "annotation")
 def annotated_dict():
     class Bad(Good):
@@ -533,71 +372,7 @@ def annotated_controls_on_a_scene_without():
     return Bad
 
 
-@mistake("coordinates", "'lambda'", "keyword")
-def keyword():
-    class Bad(Good):
-        coordinates = {"x": "m", "lambda": "m"}
-
-    return Bad
-
-
-@mistake("coordinates", "'x 1'")
-def name_with_a_blank():
-    class Bad(Good):
-        coordinates = {"x": "m", "x 1": "m"}
-
-    return Bad
-
-
-@mistake("coordinates", "'_x'")
-def name_with_an_underscore_first():
-    class Bad(Good):
-        coordinates = {"x": "m", "_x": "m"}
-
-    return Bad
-
-
-@mistake("", "'x_dot'", "derivative of 'x'")
-def coordinate_beside_its_rate():
-    class Bad(Good):
-        coordinates = {"x": "m", "y": "m", "x_dot": "m/s"}
-
-    return Bad
-
-
-@mistake("", "'x'", "free and prescribed")
-def coordinate_free_and_prescribed():
-    class Bad(Good):
-        prescribed = {"s": "m", "rise": "m", "x": "m"}
-
-    return Bad
-
-
-@mistake("", "'x_ddot'", "applied")
-def control_of_a_free_coordinate():
-    class Bad(Good):
-        controls = {"x_ddot": "m/s²"}
-
-    return Bad
-
-
-@mistake("", "'s_ddot'", "'s_dot'", "both")
-def two_controls_of_one_coordinate():
-    class Bad(Good):
-        controls = {"force": "N", "s_ddot": "m/s²", "s_dot": "m/s"}
-
-    return Bad
-
-
-@mistake("", "'motor'", "has no effect", "u.motor")
-def control_that_is_not_used():
-    class Bad(Good):
-        controls = {"force": "N", "motor": "N"}
-
-    return Bad
-
-
-@mistake("", "'x'", "coordinate")
+@mistake("'x'", "coordinate")
 def parameter_named_like_a_coordinate():
     class Bad(Good):
         x: float = parameter(1.0, "m")
@@ -605,7 +380,7 @@ def parameter_named_like_a_coordinate():
     return Bad
 
 
-@mistake("", "'y_dot'", "coordinate")
+@mistake("'y_dot'", "coordinate")
 def parameter_named_like_a_state():
     class Bad(Good):
         y_dot: float = parameter(1.0, "m")
@@ -613,7 +388,7 @@ def parameter_named_like_a_state():
     return Bad
 
 
-@mistake("", "'force'", "a control")
+@mistake("'force'", "a control")
 def parameter_named_like_a_control():
     class Bad(Good):
         force: float = parameter(1.0, "m")
@@ -637,55 +412,10 @@ def parameter_named_like_a_declaration():
     return Bad
 
 
-@mistake("", "'potential'")
+@mistake("'potential'")
 def parameter_named_like_a_formula():
     class Bad(Good):
         potential: float = parameter(1.0, "J")
-
-    return Bad
-
-
-@mistake("power", "another")
-def method_of_every_scene():
-    return changed("power", lambda self: 1.0)
-
-
-@mistake("state", "order of")
-def state_that_lacks_a_name():
-    class Bad(Good):
-        state = ("x", "x_dot", "y", "y_dot")
-
-    return Bad
-
-
-@mistake("state", "names in order")
-def state_that_is_text():
-    class Bad(Good):
-        state = "x"
-
-    return Bad
-
-
-@mistake("left_out", "'s'", "'s_dot'")
-def rate_left_out_without_its_place():
-    class Bad(Good):
-        left_out = ("s_dot",)
-
-    return Bad
-
-
-@mistake("left_out", "'z'")
-def left_out_that_is_not_there():
-    class Bad(Good):
-        left_out = ("z",)
-
-    return Bad
-
-
-@mistake("left_out", "'x_dot'", "free")
-def rate_of_a_free_coordinate_left_out():
-    class Bad(Good):
-        left_out = ("x", "x_dot")
 
     return Bad
 
@@ -712,66 +442,17 @@ def left_out_rate_that_is_needed():
     return Bad
 
 
-@mistake("left_out", "depends on 'x'")
-def left_out_free_place_that_is_needed():
-    class Bad(Good):
-        left_out = ("x",)
-
-    return Bad
-
-
 @mistake("coordinates", "index or range", "structural")
 def coordinates_that_count_a_parameter():
-    return changed("coordinates", property(lambda self: {f"x_{i}": "m" for i in range(self.spring)}))
+    return changed(coordinates=property(lambda self: {f"x_{i}": "m" for i in range(self.spring)}))
 
 
 @mistake("left_out", "comparison")
 def state_that_depends_on_a_parameter():
-    return changed("left_out", property(lambda self: () if self.friction == 0.0 else ("s",)))
+    return changed(left_out=property(lambda self: () if self.friction == 0.0 else ("s",)))
 
 
-@mistake("reactions", "'wall'", "prescribed")
-def reaction_on_what_is_not_prescribed():
-    class Bad(Good):
-        reactions = {"support": "rise", "push": "s", "wall": "x"}
-
-    return Bad
-
-
-@mistake("ratios", "'normal'", "reactions")
-def ratio_of_unknown_forces():
-    class Bad(Good):
-        ratios = {"needed": ("push", "normal")}
-
-    return Bad
-
-
-@mistake("ratios", "pair")
-def ratio_of_one_force():
-    class Bad(Good):
-        ratios = {"needed": "push"}
-
-    return Bad
-
-
-@mistake("", "controls and modes")
-def controls_and_modes():
-    class Bad(Good):
-        modes = {"pushed": {"force": "N"}}
-
-    return Bad
-
-
-@mistake("modes", "'pushed'")
-def mode_that_is_no_dict():
-    class Bad(Good):
-        controls = {}
-        modes = {"pushed": "force"}
-
-    return Bad
-
-
-@mistake("", "frozen", "kw_only=True")
+@mistake("frozen", "kw_only=True")
 def dataclass_that_is_not_frozen():
     @dataclasses.dataclass
     class Bad(Scene):
@@ -786,7 +467,7 @@ def dataclass_that_is_not_frozen():
     return Bad
 
 
-@mistake("", "frozen", "kw_only=True")
+@mistake("frozen", "kw_only=True")
 def dataclass_with_a_parameter_that_is_not_frozen():
     @dataclasses.dataclass
     class Bad(Scene):
@@ -802,7 +483,7 @@ def dataclass_with_a_parameter_that_is_not_frozen():
     return Bad
 
 
-@mistake("", "0.1", "drive, unpack and pack")
+@mistake("0.1", "drive, unpack and pack")
 def scene_of_version_0_1():
     class Bad(Good):
         def drive(self, y, u, k, xp): ...
@@ -814,7 +495,7 @@ def scene_of_version_0_1():
     return Bad
 
 
-@mistake("", "hashable")
+@mistake("hashable")
 def structural_field_that_is_a_list():
     class Bad(Good):
         lengths: tuple = ()
@@ -824,14 +505,17 @@ def structural_field_that_is_a_list():
 
 # --- the test ----------------------------------------------------------------------------------------------
 
+for name, (attributes, words) in (UNTRACEABLE | INVALID | DECLARED).items():
+    MISTAKES.append(pytest.param(partial(changed, **attributes), words.split("; "), id=name))
+
 
 def test_the_good_one_is_good():
     assert Good().state_names == ("s", "s_dot", "x", "x_dot", "y", "y_dot")
 
 
 @pytest.mark.parametrize("decorated", [False, True], ids=["plain", "decorated"])
-@pytest.mark.parametrize(("make", "formula", "words"), MISTAKES)
-def test_mistake_is_refused_by_name_and_with_the_remedy(make, formula, words, decorated):
+@pytest.mark.parametrize(("make", "words"), MISTAKES)
+def test_mistake_is_refused_by_name_and_with_the_remedy(make, words, decorated):
     bad = make()
     if decorated and isinstance(bad, type) and "__dataclass_fields__" not in vars(bad):
         bad = dataclasses.dataclass(frozen=True, kw_only=True)(bad)
@@ -840,7 +524,6 @@ def test_mistake_is_refused_by_name_and_with_the_remedy(make, formula, words, de
             bad()
         message = str(caught.value)
         assert re.match(r"Bad\b", message), message
-        assert formula in message, message
         for word in words:
             assert word in message, message
         assert len(message) < 400

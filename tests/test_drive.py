@@ -119,7 +119,7 @@ def test_the_pages_step_has_pythons_bits(browsing, alone, id):
 
 
 @pytest.mark.parametrize("kind", [*OWN, Six], ids=lambda kind: kind.__name__)
-def test_so_it_has_on_users_tasks(browsing, bare, kind):
+def test_the_pages_step_has_pythons_bits_on_users_tasks_too(browsing, bare, kind):
     """Two controls, ranges, targets, kicks, choices, a last reward, chains, nothing that acts."""
     page = browsing.open(f"{bare.as_uri()}/{incline.Tilt.id}.html", bare.as_uri())
     task = kind()

@@ -18,7 +18,7 @@ from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.imperfect.whole import WholeProgram
-from lag_envs.envs.program import Program, constants_of
+from lag_envs.envs.program import Program
 from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.leaderboard.site import driving
@@ -200,9 +200,9 @@ def test_what_is_off_leaves_everything_as_it_is():
     for keywords in (NEUTRAL, dict.fromkeys(KEYWORDS)):
         task = make_task(ID, **keywords)
         assert task.imperfections is None
-        assert numbers_of(task) == constants_of(plain)
+        assert numbers_of(task) == plain.formulas.constants()
         program = program_of(task, [numbers_of(task)])
-        assert type(program) is Program and program is program_of(plain, [constants_of(plain)])
+        assert type(program) is Program and program is program_of(plain, [plain.formulas.constants()])
 
 
 def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch):
@@ -214,7 +214,7 @@ def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch
         module, "compile_function", lambda name, source, *_, **options: printed.append(source)
     )
     task = make_task(ID)
-    program = Program(task, frozenset(n for n, x in constants_of(task).items() if x == 0.0))
+    program = Program(task, frozenset(n for n, x in task.formulas.constants().items() if x == 0.0))
     _ = program.step_one, program.start_one, program.start_all, program.finish_one
     assert len(printed) == 4 and set(program.kept) == {*program.y, *program.u, "n"}
     own = ("slot", "key_", "share", "mean_", "shown_at", "seen", "sigma", "slew", "push", "late")
@@ -314,7 +314,7 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
     own, seed, dt = env.unwrapped, 3, 0.02
     shown = [env.reset(seed=seed)[0]]
     task, state = own.task, own.state
-    formulas, k = task.formulas, constants_of(task)
+    formulas, k = task.formulas, task.formulas.constants()
     spread = action_delay if isinstance(action_delay, tuple) else (action_delay, action_delay)
     arrivals, pieces = [(0.0, 0.0)], []  # (when, which control); (when, state, control) of simulated pieces
     rng = np.random.default_rng(1)

@@ -74,7 +74,7 @@ def test_it_has_the_bits_of_the_unfused_step(id):
     [*LEARNED, *(slow(kind) for kind in OTHERS)],
     ids=lambda k: k.__name__,
 )
-def test_so_it_has_on_users_tasks(kind):
+def test_it_has_the_bits_of_the_unfused_step_on_users_tasks_too(kind):
     """Kicks, choices, two controls, targets, ranges, a last reward, nothing that acts."""
     check_bits(kind, 100)
 
@@ -279,7 +279,7 @@ def test_the_benchmark_measures_both_precisions(monkeypatch):
         (id, dtype) for id in (CHOICES.id, BAR.id) for dtype in (torch.float32, torch.float64)
     ]
     assert all(r.steps > 0.0 and r.share > 0.0 for r in found)
-    lines = benchmark_device.table(found).split("\n")
+    lines = benchmark_device.device_table(found).split("\n")
     assert len(lines) == 5 and lines[1].split()[:3] == [CHOICES.id, "float32", "7"]
     # State, its cosine and sine, control there and back, action, reward; two observations, age, three flags.
     assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 7 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 3

@@ -20,7 +20,6 @@ from test_imperfections import played
 from test_series import advance_in_python, in_python
 
 import lag_envs
-from lag_envs.envs.program import constants_of
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, TwoLinkArm
 from lag_envs.scenes.base import Scene, parameter
@@ -484,7 +483,7 @@ def test_environment_against_simulate(late):
     env.reset(seed=3, options={"state": [0.3, 0.1, 2.0, -3.0]})
     assert own.control == 0.0
     state, applied, sent = own.state, 0.0, 0.0
-    numbers = constants_of(task)
+    numbers = task.formulas.constants()
     for action in np.random.default_rng(1).uniform(-1, 1, (25, 1)).astype(np.float32):
         _, reward, *_ = env.step(action)
         mean = 0.0

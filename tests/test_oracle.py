@@ -479,7 +479,7 @@ def test_remembered(tmp_path, monkeypatch):
 
 def test_recurrences_that_lose_many_bits():
     """tanh and exp in drag and forces: rounding grows with each order, and more bits are taken."""
-    lattice = next(system.scene for system in SYSTEMS if system.name == "Lattice")
+    lattice = next(system.scene for system in SYSTEMS if system.name == "lattice")
     state = [0.7963143950173581, 9.9078134365626624e-4, -0.10207323685357128, 1.4940809122348817]
     found, finer = (oracle_of(lattice).once(state, [1.1647682194020892], 0.02, digits) for digits in (40, 60))
     assert max(abs(a - b) for a, b in zip(found, finer, strict=True)) < mpf(10) ** -38

@@ -1,54 +1,24 @@
-"""Pictures: to scale, complete, the same for everyone, and without a display."""
+"""Pictures of environments: what is shown, where, and how fast."""
 
-import base64
-import gc
-import io
 import math
-import os
-import re
-import shutil
-import subprocess
-import sys
 import time
-import warnings
-from itertools import pairwise
-from pathlib import Path
-from typing import get_args
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from covering import covering, slow
+from pictures import IDS, TASKS, length, moment, picture, shown
 from rollouts import SINGLE
 
 import lag_envs
-from lag_envs.envs import raster, rendering
+from lag_envs.envs import painting, rendering
+from lag_envs.envs.readout import STRIP_PAPER
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.picture import Picture, left_out_rates
-from lag_envs.scenes.shapes import (
-    Arrow,
-    Circle,
-    Frame,
-    Line,
-    Polygon,
-    Pose,
-    Role,
-    Ruler,
-    Window,
-    beginning,
-    placed,
-    round_length,
-    ticks,
-)
+from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Polygon, Pose, Ruler, Window, beginning, placed
 from lag_envs.tasks import Task, cylinder_in_cylinder, incline, pivoted_bar
 
 pygame = pytest.importorskip("pygame")
-
-IDS = list(lag_envs.TASKS)
-
-
-TASKS = {env_id: kind() for env_id, kind in lag_envs.TASKS.items()}
-TASKS |= {"quasi-static": incline.Tilt(control="tilt")}
 UNLIMITED = {
     pivoted_bar.SwingUpFree.id,
     incline.Brake.id,
@@ -58,31 +28,13 @@ UNLIMITED = {
 BLUE = [(0x56, 0xB4, 0xE9), (0x0B, 0x5F, 0x9C)]
 
 
-def picture(env_id, state=None, action=0.5, **options):
-    env = gym.make(env_id, render_mode="rgb_array", **options)
-    env.reset(seed=1, options=None if state is None else {"state": state})
-    env.step(np.array([action], dtype=np.float32))
-    frame = env.render()
-    env.close()
-    return frame
-
-
-def moment(task, share=0.5, **changes):
-    state = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
-    return Frame(state, share * task.limit_control, share, task.target_range and 0.1)._replace(**changes)
-
-
 def blue(frame):
     """Return height and width of the area with the colours of a body."""
     rows, columns = np.nonzero(np.any([np.all(frame == colour, axis=-1) for colour in BLUE], axis=0))
     return np.ptp(rows) + 1, np.ptp(columns) + 1
 
 
-def length(points):
-    return sum(math.dist(a, b) for a, b in pairwise(points))
-
-
-# --- pictures -----------------------------------------------------------------------------------------------
+# --- pictures ---
 
 
 @pytest.mark.parametrize("env_id", covering())
@@ -308,213 +260,23 @@ def test_record_video_without_a_warning(env_id, tmp_path):
     assert video.stat().st_size > 1000
 
 
-# --- windows ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def window(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    yield
-    pygame.display.quit()
-
-
-@pytest.mark.parametrize("env_id", covering())
-def test_window_opens_closes_and_opens_again(window, env_id):
-    env = gym.make(env_id, render_mode="human")
-    for _ in range(2):
-        env.reset(seed=1)
-        env.step(env.action_space.sample())
-        assert env.render() is None
-        assert pygame.display.get_surface().get_size() == (600, 400)
-        env.close()
-        assert not pygame.display.get_init()
-
-
-def test_window_shows_what_rgb_array_returns(window):
-    env = gym.make(incline.Tilt.id, render_mode="human")
-    env.reset(seed=1)
-    env.step(np.array([0.5], dtype=np.float32))
-    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-    assert np.array_equal(shown, picture(incline.Tilt.id))
-    env.close()
-
-
-def test_window_keeps_the_pace_of_the_control_interval(window):
-    env = gym.make(cylinder_in_cylinder.Tilt.id, render_mode="human")
-    env.reset(seed=1)
-    start = time.perf_counter()
-    for _ in range(6):
-        env.step(env.action_space.sample())
-    assert time.perf_counter() - start > 0.9 * 6 * 0.05
-    env.close()
-
-
-def test_environments_share_the_window(window):
-    envs = [gym.make(env_id, render_mode="human") for env_id in IDS[:3]]
-    for env in envs:
-        env.reset(seed=1)
-    for env in envs:
-        env.step(env.action_space.sample())
-    assert pygame.display.get_surface().get_size() == (2 * 600, 2 * 400)
-    envs[1].close()
-    envs[0].render()
-    assert pygame.display.get_surface().get_size() == (2 * 600, 400)
-    envs[0].close()
-    envs[2].close()
-    assert not pygame.display.get_init()
-
-
-def test_environment_goes_on_when_its_window_is_closed(window):
-    env = gym.make("PivotedBar-v0", render_mode="human")
-    env.reset(seed=1)
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
-    for _ in range(3):
-        env.step(env.action_space.sample())
-    assert not pygame.display.get_init()
-    env.close()
-    env.reset(seed=1)
-    assert pygame.display.get_surface() is not None
-    env.close()
-
-
-def test_keys_are_left_to_the_program(window):
-    env = gym.make("PivotedBar-v0", render_mode="human")
-    env.reset(seed=1)
-    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_LEFT))
-    env.step(env.action_space.sample())
-    assert [event.key for event in pygame.event.get(pygame.KEYDOWN)] == [pygame.K_LEFT]
-    env.close()
-
-
-def test_pygame_may_be_quit_by_others(window):
-    env, shown = (gym.make("PivotedBar-v0", render_mode=mode) for mode in ("rgb_array", "human"))
-    env.reset(seed=1)
-    shown.reset(seed=1)
-    before = env.render()
-    pygame.quit()
-    assert np.array_equal(env.render(), before)
-    shown.render()
-    assert pygame.display.get_surface() is not None
-    env.close()
-    shown.close()
-
-
-def test_missing_display_is_named(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
-    env = gym.make("PivotedBar-v0", render_mode="human")
-    with pytest.raises(gym.error.Error, match="rgb_array"):
-        env.reset(seed=1)
-    env.close()
-
-
-# --- the rest -----------------------------------------------------------------------------------------------
-
-
-def test_missing_pygame_is_named_with_its_remedy(monkeypatch):
-    env = gym.make("PivotedBar-v0", render_mode="rgb_array")
-    written = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True)
-    rendering._pygame.cache_clear()
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    for without in (env, written):
-        without.reset(seed=1)
-    assert env.render().std() > 1.0
-    remedy = r'pip install "lag-envs\[render\]"'
-    with pytest.raises(gym.error.DependencyNotInstalled, match=remedy):
-        written.render()
-    with pytest.raises(gym.error.DependencyNotInstalled, match=remedy):
-        gym.make("PivotedBar-v0", render_mode="human").reset(seed=1)
-
-
-def test_pygame_is_imported_only_for_windows_and_text():
-    code = """
-import sys, gymnasium as gym, lag_envs.envs.rendering
-env = gym.make("PivotedBar-v0", render_mode="rgb_array")
-env.reset(seed=1)
-env.step(env.action_space.sample())
-env.render()
-env.close()
-assert "pygame" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_every_role_has_a_style():
-    assert set(rendering.STYLES) == set(get_args(Role))
-
-
-def test_round_lengths_and_ticks():
-    assert [round_length(x) for x in (0.03, 0.1, 0.99, 5.0, 40.0)] == pytest.approx(
-        [0.02, 0.1, 0.5, 5.0, 20.0]
-    )
-    assert ticks(-0.25, 0.2, 0.1) == pytest.approx([-0.2, -0.1, 0.0, 0.1, 0.2])
-
-
-def test_dashes_cover_the_line():
-    dashes = list(rendering._dashes([(0.0, 0.0), (7.0, 0.0), (7.0, 13.0)], 3.0, 2.0))
-    assert sum(length(dash) for dash in dashes) == pytest.approx(3.0 * 4)
-    assert dashes[0] == [(0.0, 0.0), (3.0, 0.0)]
-    assert dashes[1] == [(5.0, 0.0), (7.0, 0.0), (7.0, 1.0)]
-
-
-def test_numbers_keep_their_width():
-    assert [rendering._number(x) for x in (-1.5, 12.345, -419.0)] == ["−1.500", "12.35", "−419.0"]
-    assert rendering._number(123456.0) == "1.23e+05"
-
-
-# --- playing by hand ---
-
-
-@pytest.mark.parametrize("env_id", SINGLE)
-def test_play_takes_every_combination_of_the_keys(env_id, monkeypatch):
-    """Gymnasium's play, called without arguments: keys are pressed, then the window is closed."""
-    from gymnasium.utils.play import play
-
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = gym.make(env_id, render_mode="rgb_array")
-    down, up = pygame.KEYDOWN, pygame.KEYUP
-    script = [(down, "a"), (down, "d"), (up, "a"), (down, "x"), (up, "d"), (pygame.QUIT, "")]
-    rest = env.unwrapped.task.rest_action
-    played = []
-
-    def press(before, after, action, reward, terminated, truncated, info):
-        played.append(action.tolist())
-        kind, key = script[len(played) - 1]
-        pygame.event.post(pygame.event.Event(kind, {"key": ord(key)} if key else {}))
-
-    play(env, callback=press, seed=1, fps=1000)
-    assert played == [[rest], [-1.0], [rest], [1.0], [1.0], [rest]]
-    env.reset(seed=1)
-    env.step(np.array([rest], dtype=np.float32))
-    assert env.unwrapped.control == 0.0
+def colours(frame, *wanted):
+    return [int(np.all(frame == painting.rgb(colour), axis=-1).sum()) for colour in wanted]
 
 
 # --- optional displays ---
 
 
-def shown(env_id, steps=5, **look):
-    env = gym.make(env_id, render_mode="rgb_array", **look)
-    env.reset(seed=1)
-    for _ in range(steps):
-        env.step(np.full(env.action_space.shape, 0.5).astype(env.action_space.dtype))
-        frame = env.render()
-    env.close()
-    return frame
-
-
-def colours(frame, *wanted):
-    return [int(np.all(frame == rendering._rgb(colour), axis=-1).sum()) for colour in wanted]
-
-
 @pytest.mark.parametrize("env_id", covering())
 def test_nothing_more_is_shown_unless_it_is_asked_for(env_id):
     plain = shown(env_id)
-    assert max(colours(plain, rendering.FORCE.edge, rendering.STRIP_PAPER)) < 20
+    assert max(colours(plain, painting.FORCE.edge, STRIP_PAPER)) < 20
     assert np.array_equal(plain, shown(env_id, show_arrows=False, show_trail=0.0, show_readout=False))
     arrows, readout = shown(env_id, show_arrows=True), shown(env_id, show_readout=True)
     unseen = not any(isinstance(s, Arrow) for s in TASKS[env_id].shapes(moment(TASKS[env_id])))
     forces = TASKS[env_id].scene.forces(TASKS[env_id].centre)
-    assert (colours(arrows, rendering.FORCE.edge)[0] > 20) == bool(forces or unseen)
-    assert colours(readout, rendering.STRIP_PAPER)[0] > 0.6 * 600 * 48
+    assert (colours(arrows, painting.FORCE.edge)[0] > 20) == bool(forces or unseen)
+    assert colours(readout, STRIP_PAPER)[0] > 0.6 * 600 * 48
     assert not np.array_equal(plain[:352], readout[:352])  # there is less room
     assert not np.array_equal(plain, shown(env_id, show_trail=1.0))
 
@@ -681,62 +443,6 @@ def test_vector_environment_renders_a_grid(tiles, shape):
     envs.close()
 
 
-# --- polygons ---
-
-
-def test_a_polygon_covers_its_area():
-    """The sum over the pixels is the area, exactly except for the rounding to bytes."""
-    rng, room = np.random.default_rng(1), np.zeros((60, 92))
-    for _ in range(200):
-        angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, 9))
-        points = np.stack([45 + 40 * np.cos(angles), 30 + 25 * np.sin(angles)], axis=1)
-        image = np.zeros((60, 90, 3), np.uint8)
-        colour, at = np.array([[255.0, 255.0, 255.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-        raster.fill(image, points, np.array([9]), np.array([0]), at, colour, room)
-        (x, y), edge = points.T, (image > 0) & (image < 255)
-        area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
-        assert image[:, :, 0].sum() / 255.0 == pytest.approx(area, abs=0.3)
-        assert edge[:, :, 0].sum() < 500 and not room.any()
-
-
-def test_polygons_are_cut_off_at_the_edges_and_blended():
-    room, image = np.zeros((4, 6)), np.full((4, 4, 3), 200, np.uint8)
-    points = np.array([(-1e9, -1e9), (1e9, -1e9), (1e9, 1.5), (-1e9, 1.5)])
-    at, colour = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]]), np.array([[0.0, 100.0, 200.0, 0.5]])
-    raster.fill(image, points, np.array([4]), np.array([0]), at, colour, room)
-    assert image[:, 2].tolist() == [[100, 150, 200], [150, 175, 200], [200, 200, 200], [200, 200, 200]]
-    assert not room.any()
-    # Beside the image, and without an extent.
-    raster.fill(image, points - (0.0, 1e3), np.array([4]), np.array([0]), at, colour, room)
-    raster.fill(image, 0.0 * points + 2.0, np.array([4]), np.array([0]), at, colour, room)
-    assert image[2:].min() == 200
-
-
-def test_png_can_be_read(tmp_path):
-    frame = shown("PivotedBar-v0")
-    (tmp_path / "a.png").write_bytes(raster.png(frame))
-    read = pygame.surfarray.array3d(pygame.image.load(tmp_path / "a.png")).swapaxes(0, 1)
-    assert np.array_equal(read, frame)
-
-
-# --- compared with the page ---
-
-
-def test_colours_and_widths_are_those_of_the_page():
-    """`site.js` paints the same shapes in a browser; its style sheet has the colours of light and dark."""
-    site = Path(rendering.__file__).parents[1] / "leaderboard" / "site" / "static"
-    css = (site / "site.css").read_text(encoding="utf-8").partition("@media")[0]
-    colour = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", css))
-    roles = re.search(r"ink\.roles = \{(.*?)\n    \};", (site / "site.js").read_text(encoding="utf-8"), re.S)
-    found = {}
-    for role, given in re.findall(r"(\w+): \[(.*)\],", roles[1]):
-        fill, edge, width, *dash = re.findall(r'get\("([\w-]+)"\)|null|([\d.]+)', given)
-        numbers = [float(x[1]) for x in (width, *dash)]
-        fills = colour[fill[0]] if fill[0] else None
-        found[role] = rendering.Style(fills, colour[edge[0]], numbers[0], tuple(numbers[1:]) or None)
-    assert found == rendering.STYLES
-
-
 # --- speed and real time ---
 
 
@@ -756,104 +462,3 @@ def test_pictures_are_quick(env_id):
         return time.process_time() - start
 
     assert min(seconds() for _ in range(5)) < 20 / 300
-
-
-def test_windows_keep_real_time(window, monkeypatch):
-    """Also if an interval is no whole number of milliseconds, or shorter than a screen's."""
-
-    class Clock:
-        """A clock that other programs do not disturb: reading it takes 0.2 ms."""
-
-        now, pictures = 0.0, 0
-
-        def perf_counter(self):
-            self.now += 2e-4
-            return self.now
-
-        def sleep(self, seconds):
-            assert seconds >= 0.0
-            self.now, self.pictures = self.now + seconds, self.pictures + 1
-
-    for dt, steps, pictures in ((0.0333, 30, 30), (0.001, 1000, 59)):
-        monkeypatch.setattr(rendering, "time", clock := Clock())
-        env = gym.make("PivotedBar-v0", render_mode="human", dt=dt)
-        env.reset(seed=1)
-        start, shown = clock.now, clock.pictures
-        for _ in range(steps):
-            env.step(np.zeros(1, np.float32))
-        assert clock.now - start == pytest.approx(steps * dt, abs=0.017)
-        assert clock.pictures - shown == pytest.approx(pictures, abs=1)
-        clock.now += 5.0  # the caller was busy: lost time is not caught up with
-        start = clock.now
-        for _ in range(steps):
-            env.step(np.zeros(1, np.float32))
-        assert clock.now - start == pytest.approx(steps * dt, abs=dt + 0.017)
-        env.close()
-
-
-def test_a_window_that_was_left_open_is_closed(window):
-    env = gym.make("PivotedBar-v0", render_mode="human")
-    env.reset(seed=1)
-    assert pygame.display.get_init()
-    del env
-    gc.collect()
-    assert not pygame.display.get_init()
-    code = "import gymnasium as gym, lag_envs; gym.make('PivotedBar-v0', render_mode='human').reset(seed=1)"
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.fixture(scope="module")
-def page():
-    """The page's painter in a browser, on an empty page."""
-    site = Path(rendering.__file__).parents[1] / "leaderboard" / "site" / "static"
-    chromium = shutil.which(os.environ.get("CHROMIUM", "chromium"))
-    if chromium is None:
-        missing = "THERE IS NO CHROMIUM, SO PICTURES WERE NOT HELD AGAINST THE PAGE'S: install chromium"
-        warnings.warn(missing, stacklevel=1)
-        pytest.skip(missing)
-    playwright = pytest.importorskip("playwright.sync_api")
-    script, count = re.subn(
-        r"\n  // --- replays -",
-        "\n  window.painter = { paint, placed, windowOf, readColours };\n  // --- replays -",
-        (site / "site.js").read_text(encoding="utf-8"),
-    )
-    assert count == 1
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=chromium)
-        page = browser.new_page(viewport={"width": 700, "height": 500})
-        page.set_content(
-            f"<style>{(site / 'site.css').read_text(encoding='utf-8')}</style>"
-            "<canvas width=600 height=400></canvas>"
-        )
-        page.evaluate("text => { try { (0, eval)(text); } catch { /* there is no board */ } }", script)
-        yield page
-        browser.close()
-
-
-PAINT = """([picture, poses, margin]) => {
-  const { paint, placed, windowOf, readColours } = window.painter;
-  readColours();
-  const pen = document.querySelector("canvas").getContext("2d");
-  pen.fillStyle = "#ffffff";
-  pen.fillRect(0, 0, 600, 400);
-  const box = { x: margin, y: margin, width: 600 - 2 * margin, height: 400 - 2 * margin };
-  const view = windowOf(picture, poses);
-  paint(pen, box, view, placed(picture, poses, view));
-  return document.querySelector("canvas").toDataURL();
-}"""
-
-
-@pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
-@pytest.mark.parametrize("env_id", covering())
-def test_pictures_are_those_of_the_page(env_id, page):
-    """Both painters, given the same shapes and poses; only roundings at edges differ."""
-    from lag_envs.leaderboard.site import scenery
-
-    task = TASKS[env_id]
-    now, picture = moment(task), Picture(task)
-    by_page = page.evaluate(PAINT, [scenery.picture_data(picture), picture.poses(now), rendering.MARGIN])
-    png = io.BytesIO(base64.b64decode(by_page.partition(",")[2]))
-    by_page = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
-    apart = np.abs(by_page - rendering.paint(task, now)).max(axis=2)
-    assert apart.mean() < 0.4 and np.mean(apart > 64) < 0.001, (apart.mean(), np.mean(apart > 64))

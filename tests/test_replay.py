@@ -91,7 +91,7 @@ def altered(field, value):
         (altered(3, "gICAgICAgAE"), "too long"),
         (altered(3, replay.pack([(65,)])), "between -64 and 64"),
         (altered(3, replay.pack([(64,)] * 3000)), "the episode ends after"),
-        (altered(3, replay.pack([(0,)]) [:2] + "A"), "run of none"),
+        (altered(3, replay.pack([(0,)]) [:2] + "A"), "an empty run"),
         (altered(4, "12"), "16 hexadecimal"),
         (altered(5, "x"), "8 hexadecimal"),
         (altered(5, "00000000"), "another step"),

@@ -218,7 +218,7 @@ def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
     status, output = command("--envs", ENV)
     assert status == 1
     for message in (
-        "seed1/result.json cannot be read", "seed 7, not of what its folder says", "result but no model.zip",
+        "seed1/result.json cannot be read", "seed 7, which is not what its folder", "result but no model.zip",
         "other hyperparameters than", "seed5/result.json cannot be read", "seed 6, nominal: UserError: the",
     ):  # fmt: skip
         assert message in output

@@ -19,7 +19,7 @@ import pytest
 from contract_scenes import ElasticPendulum, Trolley
 from covering import every, slow
 from llvmlite import binding, ir
-from series_systems import SYSTEMS, System
+from series_systems import POINTS, SYSTEMS, System
 
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.report.oracle import oracle_of
@@ -290,7 +290,7 @@ def test_where_the_mass_vanishes_within_the_step_only_less_will_do():
         def less(self, a, b):
             return bool(a <= b)
 
-    system = System(Vanishing(), lambda *_: ([[1.0]], [0.0]), (1.0,), (1.0,))
+    system = System("vanishing mass", Vanishing(), lambda *_: ([[1.0]], [0.0]), (1.0,), (1.0,))
     case = ([0.0, 1.0], [], 1.0)  # at its end the mass is 0, and any acceleration solves the equation
     assert record_of(system).force == (-1,)
     assert plain_attempt(system, case, 8, 1e-20)[0] < 1.0
@@ -300,14 +300,14 @@ def test_where_the_mass_vanishes_within_the_step_only_less_will_do():
 
 #: States at rest under forces that balance, up to roundings.
 AT_REST = {
-    "CartPole": [0.5, 0.0, math.pi, 0.0],
-    "Acrobot": [0.0] * 4,
-    "DoublePendulum": [0.1, 0.0, math.pi, 0.0, 0.0, 0.0],
-    "TriplePendulum": [0.1] + [0.0] * 7,
-    "RotaryPendulum": [1.0, 0.0, 0.0, 0.0],
-    "ElasticPendulum": [0.1, 0.0, 0.1, 0.0, -0.4 - 0.3 * 9.81 / 40.0, 0.0],
-    "TurningFrame": [0.0] * 4,
-    "Lattice": [0.0] * 4,
+    "cart-pole": [0.5, 0.0, math.pi, 0.0],
+    "acrobot": [0.0] * 4,
+    "double pendulum": [0.1, 0.0, math.pi, 0.0, 0.0, 0.0],
+    "triple pendulum": [0.1] + [0.0] * 7,
+    "rotary pendulum": [1.0, 0.0, math.pi, 0.0],
+    "elastic pendulum": [0.1, 0.0, 0.1, 0.0, -0.4 - 0.3 * 9.81 / 40.0, 0.0],
+    "turning frame": [0.0] * 4,
+    "lattice": [0.0] * 4,
 }
 
 
@@ -338,7 +338,7 @@ def count_operations(system, order):
 
 
 def test_operations_grow_no_faster_than_the_cube_of_the_number_of_links():
-    chains = [System(Chain(bars=n), None, (1.0,) * n, (1.0,) * n, (1.0,)) for n in range(1, 7)]
+    chains = [System(f"{n} bars", Chain(bars=n), None, (1.0,) * n, (1.0,) * n, (1.0,)) for n in range(1, 7)]
     counts = [count_operations(chain, 16) / (n + 1) ** 3 for n, chain in enumerate(chains)]
     assert counts == sorted(counts, reverse=True)
 
@@ -505,7 +505,7 @@ class Sled(Scene):
         return 0.5 * self.drag * v.x**2
 
 
-POLAR = System(Polar(), None, (1.0, 3.1), (1.0, 6.0), (), (1.5, 0.0))
+POLAR = System("polar", Polar(), None, (1.0, 3.1), (1.0, 6.0), (), (1.5, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -718,7 +718,7 @@ def test_every_order(order):
 
 @pytest.mark.parametrize("start", [[0.0, 0.0, 2.0, 0.0, 2.5, 0.0], [0.0, 0.0, 3.0, 5.0, -2.0, -9.0]])
 def test_undamped_pendulum_keeps_its_energy_for_a_thousand_seconds(start):
-    scene = type(SYSTEMS[2].scene)(friction=0.0)
+    scene = Chain(**POINTS | {"damping": 0.0})
     trajectory = simulate(scene, start, np.zeros((50_000, 1)), 0.02, 16)
     energy = scene.energy(trajectory[::100])["total"]
     scale = 4 * scene.mass * scene.gravity * scene.length

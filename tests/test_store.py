@@ -1,4 +1,4 @@
-"""Files that survive kills and full disks. Kills at every step of a board are in test_board.py."""
+"""Files that survive kills and full disks. Kills at every step of a board are in test_board_log.py."""
 
 import errno
 import os

@@ -302,13 +302,16 @@ def test_mistakes_are_named(arguments, message, command):
     assert status == 2 and message in output and output.startswith("agents.train: error:")
 
 
-def test_help_is_quick():
+@pytest.mark.parametrize(
+    ("module", "words"), [("train", ("result.json", "--ray")), ("demo", ("model.zip", "--new"))]
+)
+def test_help_is_quick(module, words):
     started = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-m", "agents.train", "--help"], cwd=ROOT, capture_output=True, text=True,
+        [sys.executable, "-m", f"agents.{module}", "--help"], cwd=ROOT, capture_output=True, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
     )  # fmt: skip
-    assert done.returncode == 0 and "result.json" in done.stdout and "--ray" in done.stdout
+    assert done.returncode == 0 and all(word in done.stdout for word in words)
     assert time.perf_counter() - started < 20.0
 
 
@@ -331,7 +334,7 @@ def test_on_a_local_ray_cluster(command, config, tmp_path):
     assert [json.loads((f / run.RESULT).read_text())["evaluation"]["returns"] for f in here] == returns
 
 
-def test_ray_that_is_not_there(command, config):
+def test_a_missing_ray_is_named(command, config):
     status, output = command(ENV, "--config", str(config), "--ray", "127.0.0.1:1")
     assert status == 2 and ("pip install" in output or "no Ray cluster at" in output)
 

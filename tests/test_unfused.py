@@ -40,13 +40,13 @@ def test_unfused_is_the_environments_step_to_rounding(id):
     [OWN[0], *(slow(task) for task in OWN[1:])],
     ids=lambda task: task.__name__,
 )
-def test_users_tasks_too(task):
+def test_unfused_is_the_step_of_users_tasks_too(task):
     check_against_fused(made(task), range(2))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("id", REGISTERED)
-def test_so_it_is_in_a_hundred_episodes(id):
+def test_unfused_is_the_environments_step_in_a_hundred_episodes(id):
     check_against_fused(gym.make(id).unwrapped, range(100))
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_submission import ENV, NET, built_in, learned, linear, net, network
+from small_submissions import ENV, NET, built_in, learned, linear, net, network
 
 from lag_envs.evaluation.conditions import disturbances
 from lag_envs.leaderboard import protocol

@@ -97,7 +97,7 @@ def test_a_cluster_that_does_not_start(monkeypatch):
         pass
 
 
-def test_a_cluster_that_is_not_there(monkeypatch):
+def test_a_missing_cluster_is_named(monkeypatch):
     for address in ("127.0.0.1:1", "ray://127.0.0.1:1", "host:port"):
         with pytest.raises(SpreadError, match="no Ray cluster at"):
             check_address(address)

@@ -9,7 +9,6 @@ differ by more than that integrator's error.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 import lag_envs  # noqa: F401 (registers the ids)
 from lag_envs.controllers import make_controller
 from lag_envs.mechanics.recording import parameter_values
+from lag_envs.options import module_parser
 
 MODEL = Path("data/system_identification/identified_parameters/design_C.1/model_1.0/model_parameters.yml")
 #: The driven joint.
@@ -35,11 +35,8 @@ FRICTION = {"damping": 0.001, "damping_2": 0.001, "dry_friction": 0.16, "dry_fri
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the check; return 0 where everything agrees."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.double_pendulum",
-        description=__doc__,
-        epilog="examples:\n  python -m tools.double_pendulum ../double_pendulum",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = module_parser(
+        "tools.double_pendulum", __doc__, "examples:\n  python -m tools.double_pendulum ../double_pendulum"
     )
     parser.add_argument("checkout", type=Path, help="folder with the project's checkout")
     args = parser.parse_args(arguments)

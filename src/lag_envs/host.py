@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-#: Environment variables of a process that measures, or works beside others: no library may start threads.
+#: Environment variables of a process that measures or runs beside others: no library may start threads.
 ONE_THREAD = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
     "JAX_PLATFORMS": "cpu",

@@ -257,7 +257,7 @@ def unpack(text: str, controls: int) -> list[tuple[int, ...]]:
     for i in range(0, len(numbers), controls + 1):
         *key, count = numbers[i : i + controls + 1]
         if not 0 < count <= MOST_STEPS - len(keys):
-            raise LinkError(f"the link has more than {MOST_STEPS:,} steps, or a run of none")
+            raise LinkError(f"the link has more than {MOST_STEPS:,} steps, or an empty run")
         keys += [tuple(m // 2 if m % 2 == 0 else -(m // 2) - 1 for m in key)] * count
     return keys
 

@@ -146,7 +146,7 @@ class TorchVectorEnv:
     float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
     the GPU, so it neither raises `StepRefused` nor rejects actions that are not finite. Instead, if a step
     cannot be taken, the environment keeps its state, its reward is 0, and the episode is truncated;
-    ``infos["refused"]`` tells which. There, `state` is memory that the next step overwrites.
+    ``infos["refused"]`` says which. There, `state` is memory that the next step overwrites.
 
     Parameters
     ----------

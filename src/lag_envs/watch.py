@@ -254,7 +254,7 @@ def _episode(
 
 @contextmanager
 def recorder(video: Path | None, rate: float) -> Iterator[Any]:
-    """Yield a function to call after each step; for a window it tells whether that was closed."""
+    """Yield a function to call after each step; for a window it returns whether the window was closed."""
     if video is None:
         import pygame
 

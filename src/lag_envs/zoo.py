@@ -8,7 +8,6 @@ them accept it.
 
 from __future__ import annotations
 
-import argparse
 import runpy
 import sys
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from importlib.util import find_spec
 
 import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.errors import UserError
+from lag_envs.options import module_parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -27,12 +27,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     UserError
         If the Zoo is not installed or has no such script.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m lag_envs.zoo",
-        description="Run a script of the RL Zoo on these environments; all other arguments are the script's.",
-        epilog="examples:\n  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs\n"
+    parser = module_parser(
+        "lag_envs.zoo",
+        "Run a script of the RL Zoo on these environments; all other arguments are the script's.",
+        "examples:\n  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs\n"
         "  python -m lag_envs.zoo train --help    the options of a script",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
         add_help=False,
         allow_abbrev=False,
     )

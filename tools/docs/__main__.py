@@ -6,12 +6,12 @@ leaderboard's best learned agents; with ids, only those of these environments.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from lag_envs.generated import replaced
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 from lag_envs.tasks import TASKS
 from tools.docs.environments import ROOT, by_scene
@@ -19,11 +19,10 @@ from tools.docs.environments import ROOT, by_scene
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the generated texts of this checkout."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.docs",
-        description="Write the texts generated from records.",
-        epilog="examples:\n  python -m tools.docs\n  python -m tools.docs --pictures PivotedBar-v0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = module_parser(
+        "tools.docs",
+        "Write the texts generated from records.",
+        "examples:\n  python -m tools.docs\n  python -m tools.docs --pictures PivotedBar-v0",
     )
     parser.add_argument(
         "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; all by default"

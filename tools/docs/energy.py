@@ -77,17 +77,17 @@ def _forces(scene: Any, control: float) -> dict[str, float]:
     return {name: given.get(name, 0.0) for name in scene.coordinates}
 
 
-def paths(env_id: str, seed: int = 0) -> dict[str, tuple[Array, Array]]:
+def paths(env_id: str) -> dict[str, tuple[Array, Array]]:
     """Return times [s] and balances [J] of the same random actions in both, over an episode's length.
 
     Both start from the same state of mid-task motion, and continue past the end of an episode.
     """
     task = TASKS[env_id]()
     peer, original = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped
-    original.reset(seed=seed)
+    original.reset(seed=0)
     start = np.array(task.examples.start["state"], np.float64)
     original.state = start[np.argsort(peer.order)]  # type: ignore[attr-defined]
-    actions = endless_actions(original, seed)
+    actions = endless_actions(original, 0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the episode is over
         own = record_peer(original, peer, actions, int(task.limit), to_the_end=False)

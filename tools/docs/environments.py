@@ -342,7 +342,7 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
             f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. If that does not help, for "
             "example with a link of a millimetre, an error names state and control, and the state is kept."
         )
-    for row in _summary_rows(accuracy, "environments"):
+    for row in _summary_rows(accuracy):
         if row["environment"] == env_id:
             texts.append(
                 "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
@@ -353,9 +353,9 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
     return "\n\n".join(texts)
 
 
-def _summary_rows(accuracy: Mapping[str, Any] | None, section: str) -> list[dict[str, Any]]:
+def _summary_rows(accuracy: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     for part in (accuracy or {}).get("sections", ()):
-        if part["name"] == section:
+        if part["name"] == "environments":
             return [
                 dict(zip(part["summary"]["columns"], row, strict=True)) for row in part["summary"]["rows"]
             ]

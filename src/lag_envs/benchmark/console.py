@@ -9,7 +9,7 @@ from lag_envs.benchmark.results import quartiles, times_of
 from lag_envs.tables import aligned
 
 
-def table(report: dict[str, Any]) -> list[str]:
+def report_lines(report: dict[str, Any]) -> list[str]:
     """Return the report as lines of text."""
     about, settings = report["machine"], report["settings"]
     lines = [
@@ -47,7 +47,7 @@ def table(report: dict[str, Any]) -> list[str]:
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     if costs := report.get("jacobians"):
-        lines += [*aligned(jacobians.table(costs)), ""]
+        lines += [*aligned(jacobians.jacobian_table(costs)), ""]
     if costs := report.get("backwards"):
         lines += [*aligned(jacobians.backwards_table(costs)), ""]
     if found := report.get("divisions"):

@@ -85,7 +85,7 @@ def traffic(envs: DeviceEnvs) -> int:
     return number * (2 * kept + actions + 1) + 2 * 4 * seen + FLAGS
 
 
-def table(found: Sequence[DeviceRate]) -> str:
+def device_table(found: Sequence[DeviceRate]) -> str:
     """Return the measurements as text."""
     head = ("environment", "precision", "environments", "steps/s", "share of memory's rate")
     rows = [

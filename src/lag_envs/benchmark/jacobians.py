@@ -224,7 +224,7 @@ def _least(
     return least
 
 
-def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+def jacobian_table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return the rows of a table, the first with the columns' names."""
     head = (
         "Jacobian of a step",

@@ -9,7 +9,7 @@ from typing import Any
 
 import lag_envs
 from lag_envs.benchmark import cold_start
-from lag_envs.benchmark.console import table
+from lag_envs.benchmark.console import report_lines
 from lag_envs.benchmark.contestants import contestants
 from lag_envs.benchmark.divisions import divisions
 from lag_envs.benchmark.docs import report_json, take_over
@@ -32,7 +32,7 @@ class BenchmarkSettings:
 
     ids: tuple[str, ...] = tuple(TASKS)
     files: tuple[str, ...] = ()  #: users' own files, which register some of the ids
-    keywords: tuple[str, ...] = ()  #: each as in a call: measured beside the defaults
+    keywords: tuple[str, ...] = ()  #: each as in a call: measured in addition to the defaults
     energies: bool = False  #: also scenes defined by energies alone, beside CartPole-v1
     jacobians: bool = False  #: also the cost of a step's derivatives
     divisions: bool = False  #: also how often the certificate divides steps
@@ -81,7 +81,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         report["backwards"] = backwards(settings.rounds, CLOCKS[settings.clock])
     if settings.divisions and complete:
         report["divisions"] = divisions(settings.ids)
-    print("\n".join(table(report)))
+    print("\n".join(report_lines(report)))
     if settings.output:
         Path(settings.output).write_text(report_json(report), encoding="utf-8")
         print(f"written to {settings.output}")

@@ -13,7 +13,7 @@ from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
 
 if TYPE_CHECKING:
-    from lag_envs.tasks.base import Task
+    pass
 
 #: Alternative to ids in `report`, `info`, `bench` and `play`.
 OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
@@ -39,11 +39,6 @@ def known_id(id: str) -> str:
     )
 
 
-def task_of(id: str) -> Task:
-    """Return the task of a known id, with its defaults."""
-    return TASKS[id]()
-
-
 def needs(extra: str, *packages: str) -> None:
     """Raise a UserError that names missing packages and how to install them."""
     for package in packages:
@@ -52,7 +47,7 @@ def needs(extra: str, *packages: str) -> None:
 
 
 def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
-    """Declare the option of a date to note in a result."""
+    """Declare the option for the date that a result is given."""
     today = date.today().isoformat()
     parser.add_argument("--date", default=today, help=f"date to note {where} (default: today)")
 

@@ -132,7 +132,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     if args.threads > 1 or args.clock == "cpu" or any(getattr(args, name) for name in others):
         raise UserError("--device goes only with --quick, --sizes, --rounds, --seconds; leave out the others")
     needs("torch", "torch")
-    from lag_envs.benchmark.device import rates, table
+    from lag_envs.benchmark.device import device_table, rates
     from lag_envs.device import checked_device
 
     try:
@@ -141,7 +141,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
         raise UserError(f"--device: {error}") from error
     perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
     found = rates(perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.2, args.rounds or 9)
-    print(table(found))
+    print(device_table(found))
     return 0
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, known_id, task_of
+from lag_envs.commands.base import OWN, Command, known_id
 from lag_envs.own_files import is_file
 from lag_envs.tables import aligned
 
@@ -30,7 +30,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def _line(id: str) -> tuple[str, ...]:
-    task = task_of(id)
+    task = TASKS[id]()
     return (
         id,
         ", ".join(_range(task, acting) for acting in task.formulas.acting),
@@ -63,7 +63,7 @@ def run_info(args: argparse.Namespace) -> int:
         name = task.id or type(task).__name__
     else:
         name = known_id(args.id)
-        task = task_of(name)
+        task = TASKS[name]()
     print("\n".join(facts(task, name)))
     print("\n".join(_agents(task, name, args.id)))
     return 0

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from lag_envs.commands.base import OWN, Command, count, known_id, task_of
+from lag_envs import TASKS
+from lag_envs.commands.base import OWN, Command, count, known_id
 from lag_envs.own_files import is_file
 from lag_envs.scenes.derivation import order_of
 
@@ -28,7 +29,7 @@ def run_order(args: argparse.Namespace) -> int:
         kind = own_files.one(args.id)
         own_files.made_with_defaults(kind, args.id)
     else:
-        kind = type(task_of(known_id(args.id)))
+        kind = TASKS[known_id(args.id)]
     with progress(args.rounds * len(ORDERS)) as advance:
         times = measure_orders(kind, args.num_envs, args.rounds, advance=lambda: advance(kind.__name__))
     print("\n".join(lines(kind, times, order_of(kind().scene, kind().dt))))

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.commands.base import OWN, Command, count, known_id, needs, seconds, task_of
+from lag_envs import TASKS
+from lag_envs.commands.base import OWN, Command, count, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.own_files import is_file
 
@@ -54,7 +55,7 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         "--board",
         metavar="FOLDER",
         type=Path,
-        help="a board, to find agents by name (default: the folder leaderboard, if there is one here)",
+        help="a board in which to look up agents by name (default: the folder leaderboard, if it exists)",
     )
 
 
@@ -114,7 +115,7 @@ def _shown(args: argparse.Namespace) -> tuple[str, Task]:
     if args.seed is not None and args.seed < 0:
         raise UserError(f"--seed must be at least 0, got {args.seed}")
     if not is_file(args.id):
-        return (id := known_id(args.id)), task_of(id)
+        return (id := known_id(args.id)), TASKS[id]()
     task, path = own_files.one(args.id), own_files.split_path(args.id)[0]
     (id,) = own_files.registered(f"{path}:{task.__name__}")
     return id, make_task(id)

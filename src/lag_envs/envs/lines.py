@@ -37,9 +37,9 @@ def indented(head: str, body: Sequence[str]) -> list[str]:
     return [head, *indent(body)]
 
 
-def indent(lines: Sequence[str], levels: int = 1) -> list[str]:
+def indent(lines: Sequence[str]) -> list[str]:
     """Indent lines."""
-    return ["    " * levels + line for line in lines]
+    return ["    " + line for line in lines]
 
 
 def compiled_lines(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.envs.program import constants_of, program_for
+from lag_envs.envs.program import program_for
 from lag_envs.envs.reverse import Reverse
 from lag_envs.envs.single import absent
 from lag_envs.scenes.checks import check_parameters, real_array
@@ -85,7 +85,7 @@ class Model:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        constants = constants_of(task)
+        constants = task.formulas.constants()
         program = program_for(task, absent([constants]))
         self._constants = SimpleNamespace(**constants)
         self._numbers = np.array([constants[name] for name in program.uniform])
@@ -130,9 +130,7 @@ class Model:
         refused = self._step(states, actions, targets, self._numbers, ends, rewards, ended)
         if refused:
             state, action = states[refused - 1], actions[refused - 1]
-            raise self.task.formulas.refusal(
-                state, action, self.task.dt, None, f"the step of row {refused - 1}"
-            )
+            raise self.task.formulas.refusal(state, action, self.task.dt, f"the step of row {refused - 1}")
         return ends, rewards, ended
 
     def _checked(

@@ -33,13 +33,8 @@ DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies
 SLOW = -3  #: status of a step that the fast formula does not cover
 
 
-def constants_of(task: Any) -> dict[str, float]:
-    """Return all numbers that a task's compiled functions take, by name."""
-    return task.formulas.constants()
-
-
 def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
-    """Return the program of a task: the same for all tasks that differ only in `constants_of`."""
+    """Return the program of a task: the same for all tasks that differ only in `formulas.constants()`."""
     key = (type(task), type(task.scene), task.formulas.key, absent, varying)
     if key not in _programs:
         _programs[key] = Program(task, absent, varying)

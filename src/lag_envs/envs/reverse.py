@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.envs.program import constants_of
 from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import pulled
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
@@ -53,7 +52,7 @@ class Reverse:
             raise ValueError(
                 f"{type(task).__name__} has a list of actions to choose from, which have no derivatives"
             )
-        constants = constants_of(task)
+        constants = task.formulas.constants()
         self._constants = [f"k_{name}" for name in constants]
         self._numbers = np.array([*constants.values()])
         self._absent = {f"k_{name}" for name, value in constants.items() if value == 0.0}

@@ -369,7 +369,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return program.finish_one(rows, observation, self._ids)
 
     def _refusal(self, held: NDArray[np.float64]) -> StepRefused:
-        return self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+        return self.task.formulas.refusal(self.state, single_number(held), self.task.dt, "the step")
 
     def _info(self) -> dict[str, Any]:
         if not self.diagnostics:

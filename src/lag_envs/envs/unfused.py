@@ -579,7 +579,7 @@ class Unfused:
         if f[rows.refused]:
             held = f[rows.u]
             self.numbers[:] = before
-            raise self.task.formulas.refusal(self.state, held, self.task.dt, None, "the step")
+            raise self.task.formulas.refusal(self.state, held, self.task.dt, "the step")
         self.steps += 1
         reward, ended = f[rows.reward], f[rows.ended] > 0.0
         if self.task.draws:

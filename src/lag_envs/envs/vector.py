@@ -582,8 +582,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
-        control = self.control[i]
-        error = self.tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
+        error = self.tasks[i].formulas.refusal(self.state[i], self.control[i], self.task.dt, where)
         error.results = results
         return error
 

@@ -53,7 +53,7 @@ def profile(scores: ArrayLike) -> Array:
 
 
 def iqm(values: ArrayLike, axis: int | None = -1) -> Any:
-    """Return the interquartile mean: of the values without the lowest and the highest quarter.
+    """Return the interquartile mean: the mean without the lowest and the highest quarter of the values.
 
     For five values, that is the mean of the middle three; for fewer than four, the mean of all.
 

@@ -87,22 +87,15 @@ class Finding:
 # --- what is cheap ------------------------------------------------------------------------------------------
 
 
-def sound(board: Board, pin: Path | None = None) -> tuple[BoardState, Results]:
+def sound(board: Board) -> tuple[BoardState, Results]:
     """Return a board's state and its results, by protocol and id, if all cheap checks pass.
-
-    Parameters
-    ----------
-    board : Board
-        The board.
-    pin : Path, optional
-        Pin to compare the log with; by default the release's own, if it is of this board.
 
     Raises
     ------
     BoardError
         For the first check that fails; the text names the line and the remedy.
     """
-    found = cheap(board, pin)
+    found = cheap(board)
     # History names the line that was changed; the chain only the next line that does not follow.
     findings = sorted(found.findings, key=lambda finding: finding.name != "history")
     wrong = [text for finding in findings for text in finding.wrong]
@@ -121,7 +114,7 @@ class CheapChecks:
     lines: list[LogLine] = field(default_factory=list)
     state: BoardState = field(default_factory=BoardState)
     results: Results = field(default_factory=dict)
-    #: What each submission says of itself, by id.
+    #: What each submission says about itself, by id.
     abouts: dict[str, About] = field(default_factory=dict)
 
     def chained(self, number: int) -> bool:
@@ -287,7 +280,7 @@ def _odd(found: CheapChecks, entry: BoardEntry, result: Mapping[str, Any]) -> It
         if tuple(policy["seed"] for policy in result["policies"]) != submission.seeds:
             yield "has other policies than the submission"
         if result.get("claimed") != claimed(submission):
-            yield "does not repeat what the submission says of itself"
+            yield "does not repeat what the submission says about itself"
     middle, chosen = shown_episodes(result)
     first = protocol.first_seed(entry.digest, entry.nonce, middle)
     returns = result["policies"][middle]["returns"]
@@ -361,7 +354,7 @@ def _history(board: Board, log: bytes) -> Finding:
             )
         found.told = f"{len(tagged) - before} earlier versions are the beginning of this one"
         if before:
-            found.told += f"; {before} are of boards that were begun again before there was a chain"
+            found.told += f"; {before} belong to boards that were started over before logs had a chain"
         if git(folder, "rev-parse", "--is-shallow-repository").strip() == b"true":
             found.told += "; the clone is shallow, so there may be more"
     except NoHistory as error:

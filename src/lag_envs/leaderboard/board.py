@@ -270,7 +270,7 @@ class Board:
         """Keep a result, unless the submission is no longer pending.
 
         It replaces the result of the same authors under the same name on the same board, unless the
-        submission acts like an earlier one: submitting the same again gives nobody a second chance at luck.
+        submission acts like an earlier one: submitting the same again brings no second chance.
 
         Parameters
         ----------
@@ -340,13 +340,14 @@ def current(state: BoardState, what: str) -> Protocol:
     found = state.protocols.get(state.number)
     if found is None:
         raise BoardError(
-            f"the log does not tell the scale of protocol {state.number}; `lag-envs leaderboard open` adds it"
+            f"the log does not state the scale of protocol {state.number}; "
+            "`lag-envs leaderboard open` adds it"
         )
     frozen = found.rules.model_dump()
     if odd := [name for name, rule in protocol.rules().items() if rule != frozen[name]]:
         raise BoardError(
             f"this version of lag_envs cannot {what} a board of protocol {state.number}: {odd[0]} differ; "
-            "`lag-envs leaderboard open` begins the next protocol, under which all is verified again"
+            "`lag-envs leaderboard open` begins the next protocol, under which everything is verified again"
         )
     return found
 

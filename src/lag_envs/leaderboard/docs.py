@@ -7,7 +7,6 @@ alone, so a test makes them again and compares.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from lag_envs.generated import replaced
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import boards
 from lag_envs.leaderboard.standings import board_data
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
@@ -26,11 +26,10 @@ BEST = 5
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the generated texts of a checkout."""
-    parser = argparse.ArgumentParser(
-        prog="python -m lag_envs.leaderboard.docs",
-        description="Write the leaderboard's tables into a checkout.",
-        epilog="examples:\n  python -m lag_envs.leaderboard.docs",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = module_parser(
+        "lag_envs.leaderboard.docs",
+        "Write the leaderboard's tables into a checkout.",
+        "examples:\n  python -m lag_envs.leaderboard.docs",
     )
     parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
     for path, text in generated(parser.parse_args(arguments).project).items():
@@ -78,11 +77,7 @@ def top(data: dict[str, Any]) -> str:
         first = [row for row in best if row["rank"] == best[0]["rank"]]
         learned = [row for row in best if row["kind"] == "learned"][:1]
         if first:
-            names = [
-                ", ".join(f"{plain_markdown(row['name'])} {_scored(row)}" for row in some)
-                for some in (first, learned)
-            ]
-            rows.append([environment["id"], *names])
+            rows.append([environment["id"], _listed(first), _listed(learned)])
     if not rows:
         return "Nothing has been submitted yet."
     return markdown_table(("environment", "best (95 % interval)", "best learned"), rows)

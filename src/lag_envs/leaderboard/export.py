@@ -1,6 +1,6 @@
 """Turn models of Stable-Baselines3 into a submission, and prove that both act alike.
 
-A model's file runs code when it is loaded. Export your own models; nobody else's. Networks that
+A model's file runs code when it is loaded. Export only your own models. Networks that
 ``python -m agents.ppo`` left are arrays, which are read without running anything and taken as they are.
 """
 
@@ -106,7 +106,7 @@ def _json(file: Path) -> Mapping[str, Any]:
 
 
 def algorithm_of(source: Source) -> str:
-    """Return the algorithm of a model, as its training noted or its policy tells."""
+    """Return the algorithm of a model, from the notes of its training or from its policy."""
     if (noted := (source.result or {}).get("algo")) in ALGORITHMS:
         return noted
     file = source.model

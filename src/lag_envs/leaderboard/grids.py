@@ -120,7 +120,7 @@ class _GridValues:
         return self.look_up(states, targets, taken + 1.0)[0]
 
     def look_up(self, states: Array, targets: Array, taken: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the numbers (n,), and which of them are of the mirror image."""
+        """Return the numbers (n,), and which of them come from the mirror image."""
         from lag_envs.leaderboard.kernels import interpolate
 
         time = taken * self.about.task.interval

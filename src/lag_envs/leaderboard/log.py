@@ -29,7 +29,6 @@ LOG = "board.jsonl"
 #: Largest log [bytes].
 MOST = 2**26
 STATES = ("pending", "verified", "rejected", "superseded", "withdrawn")
-KINDS = ("learned", "controller", "optimal")
 REMEDY = "restore it from version control"
 #: All of one length and in UTC, so that they sort as text, and none in a future that a clock cannot pass.
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
@@ -341,7 +340,7 @@ class BoardState:
         return [entry for entry in self.entries.values() if entry.state == "pending"]
 
     def first(self, entry: BoardEntry) -> BoardEntry | None:
-        """Return the first submission that acts like this one, None if that is this one.
+        """Return the first submission that acts like this one; None if it is the first itself.
 
         Likeness is noted with the one that was verified later; the one that was added later is linked. Links
         are followed to their end.

@@ -100,7 +100,7 @@ class ReferenceController(NamedTuple):
 
 
 def reference(env_id: str) -> ReferenceController | None:
-    """Return an environment's reference; None if its episodes differ little, or nobody measured it."""
+    """Return an environment's reference; None if its episodes differ little, or if it was not measured."""
     name, found = TASKS[env_id].reference, measured_entry(env_id).get("reference")
     return ReferenceController(name, **found) if name and found else None
 

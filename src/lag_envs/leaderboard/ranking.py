@@ -10,7 +10,7 @@ bootstrap intervals of 95 %:
 - Several policies in a row are a sample of training seeds: they are resampled within the row (the
   stratum), each with its mean fixed.
 - A row of one policy, such as a deterministic controller, has no spread of training: its episodes are
-  resampled. The interval tells how well the mean is known, and nothing about training.
+  resampled. The interval says how well the mean is known, and nothing about training.
 - The reference that measures luck has a mean that is itself uncertain. Each bootstrap sample therefore draws
   another mean from a normal distribution. The same one is used for all rows, since an error moves them all
   together, each as far as it was corrected (`slope`). The reference's own row is moved all the way: after

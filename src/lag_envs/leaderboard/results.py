@@ -1,4 +1,4 @@
-"""A verification's result as it is stored: its schema, and how two of them compare."""
+"""The stored result of a verification: its schema, and how two results are compared."""
 
 from __future__ import annotations
 

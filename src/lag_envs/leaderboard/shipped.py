@@ -7,7 +7,6 @@ that the least score per byte is lost. Controllers are in the package anyway.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lag_envs.errors import UserError
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
 FOLDER = Path(__file__).parent / "best"
@@ -53,13 +53,13 @@ def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
     return {env_id: Shipped(**entry) for env_id, entry in found.items()}
 
 
-def load(env_id: str, folder: Path = FOLDER) -> Any:
+def load(env_id: str) -> Any:
     """Return an environment's policy, with the `predict` of Stable-Baselines3."""
     from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
     from lag_envs.leaderboard.submission import read_arrays
 
-    made = architecture(env_id, shipped(folder)[env_id].policy)
-    file = folder / f"{env_id}.safetensors"
+    made = architecture(env_id, shipped()[env_id].policy)
+    file = FOLDER / f"{env_id}.safetensors"
     return SubmittedPolicy(made, read_arrays(file.name, file.read_bytes(), made)).agent()
 
 
@@ -152,11 +152,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Choose and write the policies."""
     from lag_envs.leaderboard.board import Board, BoardError
 
-    parser = argparse.ArgumentParser(
-        prog="python -m lag_envs.leaderboard.shipped",
-        description="Write the policies that come with the package: the best on the board, as data.",
-        epilog="examples:\n  python -m lag_envs.leaderboard.shipped",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = module_parser(
+        "lag_envs.leaderboard.shipped",
+        "Write the policies that come with the package: the best on the board, as data.",
+        "examples:\n  python -m lag_envs.leaderboard.shipped",
     )
     parser.add_argument(
         "--board", metavar="FOLDER", type=Path, default=Path("leaderboard"), help="default: leaderboard"

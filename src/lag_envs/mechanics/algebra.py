@@ -18,6 +18,7 @@ import math
 import numbers
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
+from functools import partial
 from typing import Any, ClassVar, NoReturn
 
 Monomial = tuple[tuple["Atom", int], ...]
@@ -366,9 +367,6 @@ def _closed(expr: Expr) -> Expr:
     return Expr({((Atom("function", "sum", expr), 1),): 1})
 
 
-FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
-
-
 def function_of(name: str, argument: Any) -> Expr:
     """Return a function of an expression."""
     argument = Expr.of(argument)
@@ -431,40 +429,15 @@ class RecordedFunctions:
     """The namespace ``xp`` of a formula that is recorded."""
 
     pi = math.pi
-
-    def sin(self, x: Any) -> Any:
-        """Return the sine."""
-        return function_of("sin", x)
-
-    def cos(self, x: Any) -> Any:
-        """Return the cosine."""
-        return function_of("cos", x)
+    sin, cos, exp, log, sqrt, atan, tanh = (
+        staticmethod(partial(function_of, name))
+        for name in ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
+    )
+    arctan = atan
 
     def tan(self, x: Any) -> Any:
         """Return the tangent."""
         return function_of("sin", x) / function_of("cos", x)
-
-    def exp(self, x: Any) -> Any:
-        """Return the exponential."""
-        return function_of("exp", x)
-
-    def log(self, x: Any) -> Any:
-        """Return the natural logarithm."""
-        return function_of("log", x)
-
-    def sqrt(self, x: Any) -> Any:
-        """Return the square root."""
-        return function_of("sqrt", x)
-
-    def atan(self, x: Any) -> Any:
-        """Return the inverse tangent."""
-        return function_of("atan", x)
-
-    def tanh(self, x: Any) -> Any:
-        """Return the hyperbolic tangent."""
-        return function_of("tanh", x)
-
-    arctan = atan
 
     def __getattr__(self, name: str) -> Any:
         raise FormulaError(

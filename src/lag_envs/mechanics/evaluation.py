@@ -12,14 +12,11 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
-
-Array = NDArray[np.float64]
 
 
 class Numeric:

@@ -403,7 +403,7 @@ def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[ReportFigure]:
             "conservation-energy",
             "Relative drift of energy over the number of control steps, the largest so far, without drag"
             " and drive.",
-            lambda: _curves(drifts, "steps", "energy", "control steps", "relative drift of energy"),
+            lambda: _curves(drifts),
         )
     if any("length" in row for row in drifts):
         yield ReportFigure(
@@ -432,23 +432,23 @@ def _panels(names: Sequence[str]) -> tuple[Figure, dict[str, Any]]:
     return figure, dict(zip(names, axes, strict=False))
 
 
-def _curves(rows: list[Row], x: str, y: str, xlabel: str, ylabel: str) -> Figure:
+def _curves(rows: list[Row]) -> Figure:
     names = list(dict.fromkeys(row["name"] for row in rows))
     figure, axes = _panels(names)
     for row in sorted(rows, key=lambda row: row["method"] == LAG_ENVS):
         axis = axes[row["name"]]
-        values = np.array([np.nan if v is None else abs(v) for v in row[y]])
+        values = np.array([np.nan if v is None else abs(v) for v in row["energy"]])
         values = np.fmax.accumulate(np.maximum(values, 1e-17)) if len(values) else values
         own = row["method"] == LAG_ENVS
         axis.loglog(
-            row[x], values, color=COLOURS[row["method"]], lw=2.2 if own else 1.1, label=row["method"],
+            row["steps"], values, color=COLOURS[row["method"]], lw=2.2 if own else 1.1, label=row["method"],
             zorder=3 if own else 2,
         )  # fmt: skip
         axis.set_title(row["name"], fontsize=9)
         axis.set_ylim(1e-17, 1e3)
         axis.grid(alpha=0.3)
-    figure.supxlabel(xlabel, fontsize=9)
-    figure.supylabel(ylabel, fontsize=9)
+    figure.supxlabel("control steps", fontsize=9)
+    figure.supylabel("relative drift of energy", fontsize=9)
     handles, labels = axes[names[0]].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=8)
     return figure

@@ -8,7 +8,6 @@ and the first figure again from ``docs/accuracy.json``. A test makes the texts a
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lag_envs.benchmark.docs import texts as speed_texts
+from lag_envs.options import module_parser
 from lag_envs.report import overview, page
 from lag_envs.report.content import ReportFigure, Table
 from lag_envs.report.report import FILE, content_of
@@ -107,13 +107,12 @@ PARTS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write a report's compact form into a checkout."""
-    parser = argparse.ArgumentParser(
-        prog="python -m lag_envs.report.docs",
-        description="Write a report's compact form into a checkout.",
-        epilog="examples:\n"
+    parser = module_parser(
+        "lag_envs.report.docs",
+        "Write a report's compact form into a checkout.",
+        "examples:\n"
         "  python -m lag_envs.report.docs report    what `lag-envs report` left in the folder report\n"
         "  python -m lag_envs.report.docs           the pages again, from the stored numbers",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "report", type=Path, nargs="?", help="the report's folder; without one the pages are written again"

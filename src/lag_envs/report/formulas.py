@@ -100,7 +100,7 @@ class OperationList:
             return self._add("atan", self._of(of), self._of(1 + of**2))
         if name in ("exp", "log"):
             return self._add(name, self._of(of))
-        raise ValueError(f"{name} of {e} is none of sin, cos, tan, exp, log, atan, tanh, sqrt")
+        raise ValueError(f"{name} of {e} is not one of sin, cos, tan, exp, log, atan, tanh, sqrt")
 
     def numbers(self, given: Sequence, constants: Sequence, xp: Any) -> list:
         """Return the values, for numbers whose functions are in `xp`."""

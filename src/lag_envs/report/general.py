@@ -224,13 +224,13 @@ def worst_and_median(found: Array, truth: tuple[Array, Array]) -> tuple[float | 
     return float(each.max()), float(np.median(each))
 
 
-def again(sample: Sample, least: int = 10_000) -> Sample:
-    """Return a quick sample, repeated from its start until it has at least this many steps."""
+def again(sample: Sample) -> Sample:
+    """Return a quick sample, repeated from its start until it has at least 10,000 steps."""
     sample.end()
     begin = process_time()
     sample.end()
     spent = max(process_time() - begin, 1e-6)
-    times = max(1, min(-(-least // sample.steps), int(0.02 / spent)))
+    times = max(1, min(-(-10_000 // sample.steps), int(0.02 / spent)))
 
     def run() -> None:
         for _ in range(times):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lag_envs import TASKS
-from lag_envs.envs.program import Program, constants_of
+from lag_envs.envs.program import Program
 from lag_envs.report.cases import Case
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import plain_series
@@ -102,7 +102,7 @@ def terms() -> Iterator[Row]:
 def carried_numbers(task: Task) -> Row:
     """Return state, terms, stages and constants of a task's compiled step, and those that nothing uses."""
     scene = task.scene
-    numbers = constants_of(task)
+    numbers = task.formulas.constants()
     absent = frozenset(name for name, value in numbers.items() if value == 0.0)
     program = Program(task, absent)
     stepped = Stepped(scene, dt=task.dt)

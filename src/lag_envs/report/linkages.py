@@ -165,12 +165,9 @@ SYSTEMS = {
 
 
 class Engine(LibraryRival):
-    """A rival with its own model, made of a system's links."""
+    """A rival with its own model, made of a system's links; it takes one state after the other."""
 
-    @property
-    def batched(self) -> bool:
-        """It takes one state after the other."""
-        return False
+    batched = False
 
 
 def _given(problems: Problems) -> tuple[System, Array, Array, Array]:
@@ -381,20 +378,20 @@ MOTIONS: dict[str, Callable[[System, Array, Array, float], tuple[Array, Array]]]
 ENGINES: dict[str, type[Engine]] = {engine.family: engine for engine in (MuJoCoLinks, PinocchioLinks)}
 
 
-def differences(system: System, family: str, count: int = 50) -> tuple[float, float]:
+def differences(system: System, family: str) -> tuple[float, float]:
     """Return the difference of an engine's mass matrices and accelerations from SymPy's at random states.
 
     Both are relative to the largest value.
     """
     from lag_envs.report.oracle import oracle_of
 
-    states, controls = system.draw(count, seed=1)
+    states, controls = system.draw(50, seed=1)
     problems = SceneProblems(system.scene, states, controls, system)
     n = problems.equation.size // 2
     q, v = system.turned(problems.y[:n]), system.turned(problems.y[n:])
     turn = system.turned(np.eye(n))
     oracle, found = oracle_of(system.scene), []
-    for j in range(count):
+    for j in range(len(states)):
         mass, acceleration = oracle.at(states[j].tolist(), controls[j].tolist())
         other, joints = MOTIONS[family](system, q[:, j], v[:, j], float(controls[j, 0]))
         found.append((turn.T @ other @ turn, mass, system.back(joints), acceleration))

@@ -40,10 +40,9 @@ class LibraryRival(Rival):
         """Return whether it can step a scene."""
         return True
 
-    @property
-    def fixed(self) -> bool:
-        """Whether the setting is a number of substeps."""
-        return self.method in self.stepped
+    def __init__(self, method: str, setting: float) -> None:
+        super().__init__(method, setting)
+        self.fixed = method in self.stepped
 
 
 # --- SciPy ---
@@ -61,16 +60,11 @@ class SciPy(LibraryRival):
     settings: ClassVar = {
         "dopri5": TOLERANCES, "dop853": TOLERANCES, "lsoda": TOLERANCES, "Radau": TOLERANCES[::2],
     }  # fmt: skip
+    shared = True
 
-    @property
-    def batched(self) -> bool:
-        """All but Radau."""
-        return self.method != "Radau"
-
-    @property
-    def shared(self) -> bool:
-        """A batch is one system."""
-        return True
+    def __init__(self, method: str, setting: float) -> None:
+        super().__init__(method, setting)
+        self.batched = method != "Radau"
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the right-hand side."""
@@ -174,11 +168,7 @@ class Heyoka(LibraryRival):
     family = "heyoka"
     NARROW = "Taylor, narrow"
     settings: ClassVar = {"Taylor": (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)}
-
-    @property
-    def changing(self) -> bool:
-        """The compiled loop goes through several controls."""
-        return True
+    changing = True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the integrator, and find its step function."""
@@ -392,11 +382,7 @@ class Torchdiffeq(LibraryRival):
         "dopri5": TOLERANCES[::2], "dopri8": TOLERANCES[::2], "rk4, fixed": SUBSTEPS[:3],
     }  # fmt: skip
     stepped = ("rk4, fixed",)
-
-    @property
-    def shared(self) -> bool:
-        """A batch is one tensor."""
-        return True
+    shared = True  # a batch is one tensor
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Import it."""
@@ -461,10 +447,7 @@ class MuJoCo(LibraryRival):
         """Return whether there is a model of the scene."""
         return any(kind in MODELS for kind in type(scene).__mro__)
 
-    @property
-    def batched(self) -> bool:
-        """A rollout takes one state after the other."""
-        return False
+    batched = False  # a rollout takes one state after the other
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make a model of every problem."""

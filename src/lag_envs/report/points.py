@@ -68,7 +68,7 @@ class WorkPrecisionPoint(NamedTuple):
 def gathered(rows: Sequence[Row]) -> list[WorkPrecisionPoint]:
     """Return the points, with all times as on a machine of one speed.
 
-    Each job has timed lag_envs in turn with its own samples, as its clock. Times are multiplied by the ratio
+    Each job timed lag_envs in turn with its own samples, as a clock. Times are multiplied by the ratio
     of the clock in our own job to that job's clock. A method without a batch counts there as it does alone.
     """
     measured = [r for r in rows if r["kind"] == "point" and "problem" not in r]

@@ -74,16 +74,7 @@ class CompiledRadau(Rival):
 
     family = "compiled"
     METHOD = "Radau IIA"
-
-    @property
-    def fixed(self) -> bool:
-        """All steps are alike."""
-        return True
-
-    @property
-    def batched(self) -> bool:
-        """It takes one state after the other."""
-        return False
+    fixed, batched = True, False
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the loop."""

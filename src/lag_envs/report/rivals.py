@@ -40,19 +40,17 @@ class Rival(ABC):
 
     #: Where it comes from: a package's name, "compiled", or "lag_envs".
     family: ClassVar[str]
+    #: Whether all steps have one length, so that time goes with their number whatever the horizon.
+    fixed = False
+    #: Whether it can take many states at once.
+    batched = True
+    #: Whether the states of a batch share their steps, so that each one's error depends on the others.
+    shared = False
+    #: Whether one call can go through many controls.
+    changing = False
 
     def __init__(self, method: str, setting: float) -> None:
         self.method, self.setting = method, setting
-
-    @property
-    def fixed(self) -> bool:
-        """Whether all steps have one length, so that time goes with their number whatever the horizon."""
-        return False
-
-    @property
-    def batched(self) -> bool:
-        """Whether it can take many states at once."""
-        return True
 
     @abstractmethod
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
@@ -80,16 +78,6 @@ class Rival(ABC):
             For an equation that it cannot solve.
         """
 
-    @property
-    def shared(self) -> bool:
-        """Whether the states of a batch share their steps, so that each one's error depends on the others."""
-        return False
-
-    @property
-    def changing(self) -> bool:
-        """Whether one call can go through many controls."""
-        return False
-
     def substeps(self, steps: int) -> int:
         """Return the number of steps over some control steps, for a fixed method."""
         return max(1, round(self.setting * steps))
@@ -105,15 +93,11 @@ class ShippedStepping(Rival):
     METHOD = "lag_envs"  #: control step by control step, like an environment
     ONE_CALL = "lag_envs, one call"  #: the whole time as one step, which `simulate` divides by the bound
 
-    @property
-    def fixed(self) -> bool:
-        """Long times as sequences of steps, or in one call."""
-        return self.method == self.METHOD
+    changing = True  # a trajectory has a control for each step
 
-    @property
-    def changing(self) -> bool:
-        """A trajectory has a control for each step."""
-        return True
+    def __init__(self, method: str, setting: float) -> None:
+        super().__init__(method, setting)
+        self.fixed = method == self.METHOD
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the scene's own step; scenes with other parameters are separate batches."""
@@ -157,15 +141,7 @@ class CompiledMethod(Rival):
     family = "compiled"
     CARRIED = ", carried"  #: suffix of a method that carries cosine and sine along
 
-    @property
-    def fixed(self) -> bool:
-        """All steps are alike."""
-        return True
-
-    @property
-    def changing(self) -> bool:
-        """Its loop goes through several controls."""
-        return True
+    fixed = changing = True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the loop."""

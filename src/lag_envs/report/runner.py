@@ -48,7 +48,7 @@ class ReportJob:
     function: str
     arguments: dict[str, Any] = field(default_factory=dict)
     timeout: float = 120.0  #: seconds until it counts as hanging
-    alone: bool = False  #: measures time, so nothing else may run beside it
+    alone: bool = False  #: measures time, so nothing else may run at the same time
 
     @property
     def key(self) -> str:

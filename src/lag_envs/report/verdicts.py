@@ -7,7 +7,7 @@ stepping; defeats are reported like wins. Sentences are made from the numbers, s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -57,7 +57,7 @@ class Duel(NamedTuple):
 
     @property
     def lost(self) -> bool:
-        """Whether a rival is faster, or alone in reaching the error."""
+        """Whether a rival is faster, or the only one that reaches the error."""
         return self.rival is not None and (self.ratio is None or self.ratio < 1.0)
 
     @property
@@ -176,12 +176,8 @@ def _finding(found: Sequence[Duel]) -> str:
         ("nobody gets there", [d for d in found if not d.rival and not d.own]),
     ):
         if some:
-            parts.append(f"{words} in {len(some)} ({_listed(d.where for d in some)})")
+            parts.append(f"{words} in {len(some)} ({', '.join(d.where for d in some)})")
     return "; ".join(parts)
-
-
-def _listed(parts: Iterable[str]) -> str:
-    return ", ".join(parts)
 
 
 # --- tables ---
@@ -365,7 +361,7 @@ def claims(rows: Sequence[Row], points: Sequence[WorkPrecisionPoint], found: Seq
             f"integrator of order 4 and more, errs by at most {ACCURATE:.0e} in one step",
             finest,
             lambda: not off,
-            lambda: _listed(off) if off else f"{len(finest)} forms; largest {max(finest.values()):.1e}",
+            lambda: ", ".join(off) if off else f"{len(finest)} forms; largest {max(finest.values()):.1e}",
         )
     )
     slopes = [

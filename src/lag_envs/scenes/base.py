@@ -202,7 +202,7 @@ class Scene(metaclass=SceneType):
         """The derived equations, as expressions."""
         if TWIN in vars(self):
             raise FormulaError(
-                "a formula calls what is derived from it; it may use parameters and other formulas"
+                "a formula calls something derived from it; it may use only parameters and other formulas"
             )
         found = vars(self).get("_cached_mechanics")
         if found is None:

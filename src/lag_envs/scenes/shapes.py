@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -157,15 +158,16 @@ def outlines(shapes: Sequence[Shape]) -> list[Shape]:
     return [shape._replace(role="target") for shape in shapes if isinstance(shape, Polygon)]
 
 
+def in_plane(pose: Pose, point: Point) -> Point:
+    """Return the place of a frame's point in the plane."""
+    c, s, way = math.cos(pose.angle), math.sin(pose.angle), -1.0 if pose.part < 0.0 else 1.0
+    a, b = point[0], way * point[1]
+    return pose.x + c * a - s * b, pose.y + s * a + c * b
+
+
 def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
     """Return the visible part of a shape, moved from its frame to the plane."""
-    x, y, angle, part = pose
-    c, s, way = math.cos(angle), math.sin(angle), -1.0 if part < 0.0 else 1.0
-
-    def move(point: Point) -> Point:
-        a, b = point[0], way * point[1]
-        return x + c * a - s * b, y + s * a + c * b
-
+    move = partial(in_plane, pose)
     match shape:
         case Circle() | Magnifier():
             return [shape._replace(centre=move(shape.centre))]
@@ -174,7 +176,7 @@ def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
         case Ruler(_, size, role):
             return [Line([move((a, 0.0)), move((a, -size))], role) for a in ruled(shape, pose, view)]
         case _:
-            return [shape._replace(points=[move(point) for point in beginning(shape.points, abs(part))])]
+            return [shape._replace(points=[move(point) for point in beginning(shape.points, abs(pose.part))])]
 
 
 def ruled(ruler: Ruler, pose: Pose, view: Window) -> list[float]:

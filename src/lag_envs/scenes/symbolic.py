@@ -286,6 +286,6 @@ def evaluate_expression(expression: Any, values: Mapping[Any, Any], xp: Any) -> 
             f"formula{time}; declare it"
         )
     raise FormulaError(
-        f"{expression.func.__name__} in {expression!s:.40} is none of sin, cos, tan, atan, tanh, sqrt, exp, "
-        "log; rewrite it in these"
+        f"{expression.func.__name__} in {expression!s:.40} is not one of sin, cos, tan, atan, tanh, sqrt, "
+        "exp, log; rewrite it in these"
     )

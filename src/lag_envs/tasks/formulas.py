@@ -192,11 +192,11 @@ class TaskFormulas:
         shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
         return scene.mechanics.key, self._task.variant, formulas, *plain, *own, *shared
 
-    def refusal(self, state: Any, control: Any, dt: float, trajectory: Any, where: str) -> StepRefused:
+    def refusal(self, state: Any, control: Any, dt: float, where: str) -> StepRefused:
         """Return the error for a step that was refused."""
         found = self._task.imperfections
         lagged = bool(found and found.lag)
-        return refusal(self._task.scene, state, control, dt, trajectory, where, lagged=lagged)
+        return refusal(self._task.scene, state, control, dt, None, where, lagged=lagged)
 
     def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""

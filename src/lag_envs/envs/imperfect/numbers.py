@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from lag_envs.envs.program import constants_of
 from lag_envs.scenes.derivation import motion_constants_of, step_argument_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import seen_box
@@ -15,8 +14,9 @@ def numbers_of(task: Task) -> dict[str, float]:
     """Return every number that an environment's compiled functions take, by name."""
     found = task.imperfections
     if found is None:
-        return constants_of(task)
-    numbers = dict(constants_of(task.drawn.inner if task.drawn else task))
+        return task.formulas.constants()
+    inner = task.drawn.inner if task.drawn else task
+    numbers = dict(inner.formulas.constants())
     for name, values in (
         ("sigma", found.observation_noise),
         ("shake", found.action_noise),

@@ -3,9 +3,9 @@
  *
  * The step comes as functions that Python printed (lag_envs/envs/unfused.py); no physics is written here.
  * Arrays are named as there: k constants, f one environment's row, a action, d draws in [0, 1), p poses.
- * Of imperfect sensors and actuators, scripts have drawn parameters, noise and delayed actions.
+ * Of the imperfections of sensors and actuators, scripts know drawn parameters, noise and delayed actions.
  *
- * In this order: random numbers, episodes, links, agents, the person's hands, the stage.
+ * In this order: random numbers, episodes, links, agents, the player's input, the stage.
  */
 (() => {
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
@@ -177,7 +177,7 @@
     for (let i = 0; i < numbers.length; i += wide) {
       const key = numbers.slice(i, i + wide - 1).map((m) => (m % 2 ? -(m - 1) / 2 - 1 : m / 2));
       const count = numbers[i + wide - 1];
-      if (!count || keys.length + count > 100000) throw new Error("The link has too many steps, or a run of none.");
+      if (!count || keys.length + count > 100000) throw new Error("The link has too many steps, or an empty run.");
       key.forEach((n, j) => {
         const many = controls[j].values.length;
         const [low, high] = many ? [0, many - 1] : [-levels, levels];
@@ -238,7 +238,7 @@
     return (episode) => actionsFrom(numbers(episode), about);
   }
 
-  /** Numbers as an action: clipped where it lies in a range, else the largest of each list's chooses. */
+  /** Numbers as an action: clipped in a range; in a list, the largest number chooses. */
   function actionsFrom(numbers, { choices, largest }) {
     if (!choices.length) return Array.from(numbers, (x) => Math.fround(clamp(x, -largest, largest)));
     let end = 0;
@@ -413,7 +413,7 @@
     };
   }
 
-  // --- the person's hands ----------------------------------------------------------------------------------
+  // --- the player's input ----------------------------------------------------------------------------------
 
   const PAIRS = [["ArrowLeft", "ArrowRight"], ["ArrowDown", "ArrowUp"], ["a", "d"], ["s", "w"]];
   const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowDown: "↓", ArrowUp: "↑" };
@@ -675,7 +675,7 @@
       const [trial, act] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest)];
       let steps = 0;
       const more = () => {
-        if (running || me.steps) return; // an agent may remember what it saw since its episode began
+        if (running || me.steps) return; // an agent may have a memory that reaches back to the start of its episode
         const end = performance.now() + 2;
         do {
           if (trial.over) trial.restart(big(steps));
