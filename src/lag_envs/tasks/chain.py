@@ -268,9 +268,9 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in t
         "one could."
     )
     note = """
-Planning anew for each start is best. When the board opened, the plans went on far beyond the catch; those that
-end with it have been found since and are better, so scores above one are possible. One recorded plan with
-time-varying feedback comes close, because all starts are close together.
+Planning anew for each start is best. When the board opened, the plans went on far beyond the catch; those
+that end with it have been found since and are better, so scores above one are possible. One recorded plan
+with time-varying feedback comes close, because all starts are close together.
 """
 
 
