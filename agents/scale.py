@@ -4,9 +4,9 @@
 task's controllers and the board's reference, and prints means and standard errors beside the numbers in use.
 A slow policy plays only the first episodes, and its luck is corrected by the reference's returns in these and
 in all episodes (a control variate). The reference's own number comes from other, independent episodes.
-``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use stay, and an environment without
-any gets new ones. Its best known policy is then the best of its controllers and of the trained learners, each
-of which plays with the seed that ended best.
+``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use stay, and an environment
+without any gets new ones. Its best known policy is then the best of its controllers and of the trained
+learners, each of which plays with the seed that ended best.
 """
 
 from __future__ import annotations
