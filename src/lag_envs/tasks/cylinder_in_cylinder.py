@@ -339,7 +339,8 @@ class Pump(_Shell):
     }
     hyperparameters = {
         "ppo": {**_PPO, "n_timesteps": 8e5, "normalize": True},
-        "off_policy": {"gamma": 0.98},
+        # A push pays some steps later, and costs at once.
+        "off_policy": {"gamma": 0.98, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_2e-3"},
     }
     value_iteration = ValueIteration(
         (
