@@ -581,6 +581,11 @@ class Balance(_ChainTask):
             "n_timesteps": 1e6, "gae_lambda": 0.8, "max_grad_norm": 1.0, "reward_scale": 1.0,
             "critic": [64, 64],
         },
+        # Large noise, kept for long, tips the bars over.
+        "td3": {
+            "n_steps": 3, "gradient_steps": 2, "learning_rate": "lin_2e-3",
+            "policy_kwargs": {"noise": 0.15, "noise_steps": 4},
+        },
     }  # fmt: skip
     note = """
 The LQR is tuned for small deviations; feedback with directly optimised gains survives larger kicks.
