@@ -131,7 +131,7 @@ def rewritten(board, change):
     ("change", "reason"),
     [
         (lambda told: told.pop(1), "line 3: .* is verified, and was never added"),
-        (lambda told: told.pop(0), "line 4: .*|does not tell"),
+        (lambda told: told.pop(0), "line 4: .*|does not state the scale"),
         (lambda told: told.pop(2), "line 3: .* nonce 'n', which is not its own"),
         (lambda told: told.insert(1, told.pop(2)), "line 3: .* is earlier than the line before it"),
         (lambda told: told.append(told[3]), "line 5: .* is verified, but was verified already"),

@@ -512,7 +512,7 @@ def test_scene_of_sympys_expressions_has_all_functions():
         ("q * t", "time"),
         ("q ** 1.5", "power"),
         ("q_dot ** 2", "q_dot is neither"),
-        ("I * q", "none of|neither|real"),
+        ("I * q", "not one of|neither|real"),
         ("Piecewise((q, q > 0), (0, True))", "Piecewise"),
     ],
 )
