@@ -1,12 +1,12 @@
 """Measure the mean returns that define scores and the leaderboard's references.
 
 ``python -m agents.scale`` plays, for each environment, random actions, no control, the best known policy, the
-task's controllers and the board's reference, and prints means and standard errors beside the numbers in use.
-A slow policy plays only the first episodes, and its luck is corrected by the reference's returns in these and
-in all episodes (a control variate). The reference's own number comes from other, independent episodes.
-``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use stay, and an environment
-without any gets new ones. Its best known policy is then the best of its controllers and of the trained
-learners, each of which plays with the seed that ended best.
+controllers that plan or were measured before, and the board's reference, and prints means and standard errors
+beside the numbers in use. A slow policy plays only the first episodes, and its luck is corrected by the
+reference's returns in these and in all episodes (a control variate). The reference's own number comes from
+other, independent episodes. ``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use
+stay, and an environment without any gets new ones. Its best known policy is then the best of its controllers
+and of the trained learners, each of which plays with the seed that ended best.
 """
 
 from __future__ import annotations
@@ -136,9 +136,10 @@ def measure_environment(
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
     known, learners = controllers(task), trained(env_id, runs)
     slow = {name: planned for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
-    names = ["random", "zero", *([scale["policy"]] if scale else []), *task.controllers]
+    names = ["random", "zero", *([scale["policy"]] if scale else [])]
     if not scale or task.open:
-        names += learners
+        names += [*task.controllers, *learners]
+    names += [name for name, found in known.items() if found.plans or name in kept.get("measured", {})]
     if not scale and env_id in played():
         names.append("optimal")
     found: dict[str, Any] = {}

@@ -10,7 +10,6 @@ from lag_envs.envs import sharing
 from lag_envs.envs.imperfect.actuators import Actuators
 from lag_envs.envs.imperfect.drawn import DrawnProgram
 from lag_envs.envs.imperfect.motion import Held, Lagged
-from lag_envs.envs.imperfect.pushes import pushes
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import compiled_lines, indent, next_episode
@@ -44,9 +43,7 @@ class DividedProgram(DrawnProgram):
         found, scene, trace = self.options, self._source.scene, formulas.trace
         self._sensors = Sensors(found, self.o, self.observe, self._bounded, constants, trace)
         self._actuators = Actuators(found, formulas, self.a, self.y, self.u, self.clip, constants)
-        pushed, lines = pushes(found, self.moved, constants)
-        self.moved, self.kick = pushed, [*self.kick, *lines]
-        self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
+        self._add_pushes(constants)
         self._lagged: Any = None
         self._motion: Held | Lagged
         if found.lag:

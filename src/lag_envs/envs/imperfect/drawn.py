@@ -7,6 +7,7 @@ from typing import Any
 from lag_envs.envs.imperfect.derived import DerivedConstants
 from lag_envs.envs.imperfect.draws import purpose_key
 from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.pushes import pushes
 from lag_envs.envs.program import Program
 from lag_envs.tasks.base import Task
 
@@ -42,6 +43,12 @@ class DrawnProgram(Program):
             for o, (low, high) in zip(self.o, limits, strict=True)
         ]
         self._bound_observations()
+
+    def _add_pushes(self, constants: dict[str, Any]) -> None:
+        """Let pushes follow the kicks; for programs with further imperfections."""
+        self.moved, lines = pushes(self.options, self.moved, constants)
+        self.kick = [*self.kick, *lines]
+        self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
 
     def _bound_observations(self) -> None:
         self.observe = [*self.observe, *self._bounded]

@@ -6,7 +6,6 @@ from typing import Any
 
 from lag_envs.envs.imperfect.actuators import Actuators
 from lag_envs.envs.imperfect.drawn import DrawnProgram
-from lag_envs.envs.imperfect.pushes import pushes
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import indent, indented
@@ -41,9 +40,7 @@ class WholeProgram(DrawnProgram):
         self.reached = actuators.reached
         self.reaching = [f"next_{c}" for c in self.reached]
         self.own = [*self.own, *self.reached, *sensors.shown, *actuators.ring.names, *sensors.ring.names]
-        pushed, lines = pushes(found, self.moved, constants)
-        self.moved, self.kick = pushed, [*self.kick, *lines]
-        self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
+        self._add_pushes(constants)
 
     def _bound_observations(self) -> None:
         """Leave observations unbounded: what the sensors show is bounded later."""
