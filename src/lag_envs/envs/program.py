@@ -62,7 +62,7 @@ class Program:
     #: Further rows that are kept, and those of them and of the constants that are set at an episode's start.
     own: Sequence[str] = ()
     drawn: Sequence[str] = ()
-    #: Those of its own rows that a step reads, and their names once it is accepted.
+    #: Those of its own rows that a step replaces once it is accepted, and the names of their new values.
     reached: Sequence[str] = ()
     reaching: Sequence[str] = ()
     #: Whether a batch has a loop after the step for what the sensors show.
@@ -302,7 +302,7 @@ class Program:
             "return r, np.int64(over)",
         ]  # fmt: skip
 
-    # What a subclass does before the controls, and with the observation.
+    # What a subclass may do before the controls, and with the observation.
 
     @property
     def _command_one(self) -> list[str]:
@@ -464,7 +464,7 @@ class Program:
     #: The key of the current environment's episode.
     _key = "key = ids[last + first + i]"
 
-    # What a subclass does before the controls, and with the observation; see above for one environment.
+    # The same for a batch.
 
     @property
     def _command_lanes(self) -> list[str]:

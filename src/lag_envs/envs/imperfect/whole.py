@@ -1,4 +1,4 @@
-"""Steps at whose ends alone commands change and sensors read: a batch is stepped side by side."""
+"""Steps during which no command changes and no sensor reads, so that a batch is stepped side by side."""
 
 from __future__ import annotations
 
@@ -51,6 +51,10 @@ class WholeProgram(DrawnProgram):
         command = ["h = k_dt", *self._actuators.command, *(f"{after} = {c}" for after, c in reached)]
         return [*self.clip, *command]
 
+    def _begin(self, rows: RowsWithRings) -> list[str]:
+        """Return the lines that begin an episode, after its start is drawn."""
+        return [*self._actuators.begin(rows), *rows.store(self.reached), *self._sensors.begin(rows)]
+
     # --- one environment ------------------------------------------------------------------------------------
 
     @property
@@ -63,10 +67,7 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _begin_one(self) -> list[str]:
-        return [
-            *self._actuators.begin(self._single), *self._single.store(self.reached),
-            *self._sensors.begin(self._single),
-        ]  # fmt: skip
+        return self._begin(self._single)
 
     @property
     def _show_one(self) -> list[str]:
@@ -117,10 +118,7 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _begin_lane(self) -> list[str]:
-        return [
-            *self._actuators.begin(self._lane), *self._lane.store(self.reached),
-            *self._sensors.begin(self._lane),
-        ]  # fmt: skip
+        return self._begin(self._lane)
 
     @property
     def _show_lane(self) -> list[str]:
