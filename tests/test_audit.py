@@ -11,7 +11,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
-from covering import slow
+from covering import every, slow
 from fake_submissions import ENV, write
 
 from lag_envs import cli
@@ -272,7 +272,7 @@ LOG = {
 
 
 @needs_git
-@pytest.mark.parametrize("how", LOG)
+@pytest.mark.parametrize("how", every(3, LOG))
 @pytest.mark.parametrize("chain", [False, True], ids=["by hand", "with the chain rebuilt"])
 def test_the_log_is_edited(board, how, chain):
     before = board.log.read_bytes()

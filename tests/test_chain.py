@@ -40,6 +40,7 @@ def returns_from(kind, state, agent):
 # --- rewards ---
 
 
+@pytest.mark.slow
 @each_swing_up
 def test_spinning_does_not_pay(kind):
     """A chain that spins stretched out earns 35/128 a step, the mean of h⁴; learning that must not pay."""

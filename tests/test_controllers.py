@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import quick, slow
+from covering import engine, quick, slow
 from rollouts import SINGLE
 
 from agents import tune
@@ -53,7 +53,7 @@ def kept(env_id, name):
 @pytest.mark.parametrize(
     ("env_id", "name"),
     [
-        (env_id, name) if env_id in quick(KEPT) else slow(env_id, name)
+        (env_id, name) if env_id in quick(KEPT, of=engine) else slow(env_id, name)
         for env_id, name, found in ALL
         if not found.plans
     ],
@@ -230,6 +230,7 @@ def test_what_cannot_work_is_refused():
 # --- tuning ---
 
 
+@pytest.mark.slow
 def test_tuning(capsys, monkeypatch):
     for env_id, name, found in ALL:
         build(make_task(env_id), name, **{key: 0.5 * sum(ends) for key, ends in found.tune.items()})

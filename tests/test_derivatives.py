@@ -69,7 +69,7 @@ ZERO = {
 }
 
 
-@pytest.mark.parametrize("case", [name if name == "damping" else slow(name) for name in ZERO])
+@pytest.mark.parametrize("case", [name if name == "tilt" else slow(name) for name in ZERO])
 def test_parameters_that_are_zero(case):
     scene, state, control, name = ZERO[case]
     assert getattr(scene, name) == 0.0
@@ -267,6 +267,7 @@ def test_choices_have_no_gradient():
         Model(task).vjp([[0.0] * 4], [1])
 
 
+@pytest.mark.slow
 def test_task_without_actions():
     task = own_tasks.Drift()  # rewards theta's change
     given = {"by_states": [[1.0, 0.0]], "by_rewards": 1.0, "parameters": ["length"]}

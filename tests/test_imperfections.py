@@ -86,7 +86,8 @@ def test_all_together_single_and_vector(mode):
 WHOLE = ALL | {"observation_delay": 0.04, "action_delay": 0.06, "lag": None}
 
 
-@pytest.mark.parametrize("mode", ["NextStep", slow("SameStep")])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_what_divides_no_step_single_and_vector(mode):
     _, envs = played(ID, 3, 70, mode, duration=0.5, **WHOLE)
     assert type(envs.unwrapped._program) is WholeProgram

@@ -179,6 +179,7 @@ def test_build(run):
     assert run("build", "other")[0] == 2 and Path("other/index.html").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_serve(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")

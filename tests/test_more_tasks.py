@@ -121,6 +121,7 @@ def test_easy_entries_are_no_gift():
 # --- the arm ---
 
 
+@pytest.mark.slow
 def test_the_arm_needs_more_than_springs():
     found = {name: play(Reach.id, make_controller(Reach.id, name), range(100)) for name in Reach.controllers}
     assert found["springs"].mean() + 50.0 < found["computed torque"].mean() < 190.0

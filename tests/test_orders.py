@@ -60,6 +60,7 @@ def test_advice(now, said):
     assert said in text[-1]
 
 
+@pytest.mark.slow
 def test_command(capsys):
     gym.registry.pop("BallOnBeam-v0", None)
     assert main(["order", EXAMPLE, "--num-envs", "16", "--rounds", "1"]) == 0

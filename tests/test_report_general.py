@@ -130,7 +130,8 @@ def test_it_is_what_simulate_does(name, together):
     assert np.array_equal(found, paths)
 
 
-@pytest.mark.parametrize("name", ["cart-pole", slow("rotary pendulum")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cart-pole", "rotary pendulum"])
 def test_every_rival_converges(name):
     """No form is fast because it is broken."""
     assert worst(CertifiedSeries(CertifiedSeries.method_of(12), 1e-6), name) < 1e-5

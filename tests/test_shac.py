@@ -123,6 +123,7 @@ def test_mistakes_are_named(algo, env_id, changes, message):
         module.Learner(env_id, module.Settings.of(zoo_hyperparameters(algo, env_id) | changes), 0, 1000)
 
 
+@pytest.mark.slow
 def test_commands_know_them(tmp_path, capsys):
     given = [FREE, "--algo", *SHORT, "--steps", "6400", "--output", str(tmp_path)]
     assert train.main([*given, "--jobs", "1"]) == 0

@@ -244,7 +244,7 @@ def pendulum_errors(theta, omega, drive, dt):
 
 
 @pytest.mark.parametrize("decay", [79.0, *(slow(x) for x in (83.0, 110.0, 800.0))])
-@pytest.mark.parametrize("share", [0.999e-3, 1.001e-3, slow(1e-5)])
+@pytest.mark.parametrize("share", [1.001e-3, slow(0.999e-3), slow(1e-5)])
 def test_heavy_damping_at_its_thresholds(decay, share):
     """field = share gamma², gamma dt = decay: on both sides of where the slow manifold is used."""
     dt = 0.02

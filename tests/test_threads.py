@@ -81,6 +81,7 @@ def test_a_bad_action_steps_nothing():
     assert digest(envs, 5, seed=None) == digest(twin, 5, seed=None)
 
 
+@pytest.mark.slow
 def test_refused_environments_do_not_stop_the_others():
     """The named environment is the last, as with one thread."""
     stuck = [BLOCK + 3, 4 * BLOCK, 5 * BLOCK + 1]

@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch")
 from lag_envs.torch import Step, TorchVectorEnv  # noqa: E402
 
 #: One with a closed form, and one of the general series.
-IDS = ["PivotedBar-v0", CartPoleContinuous.id]
+IDS = ["PivotedBar-v0", slow(CartPoleContinuous.id)]
 
 
 @pytest.fixture(scope="module")

@@ -172,7 +172,7 @@ def test_same_bits_with_a_coarse_step(env_id):
     assert_alike(native, sync, 300)
 
 
-@in_every_mode()
+@in_every_mode(of=engine)
 def test_same_diagnostics(env_id, mode):
     native, sync = pair(env_id, 5, mode, diagnostics=True, **lasting(env_id, 25))
     assert_same(native.reset(seed=3), sync.reset(seed=3))
