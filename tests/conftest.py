@@ -16,17 +16,14 @@ gc.set_threshold(100_000, 50, 50)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture
-def unregistered():
-    """Forget the example, before and after, so that the next import registers it."""
-
-    def forget():
-        gym.registry.pop("BallOnBeam-v0", None)
-        sys.modules.pop("ball_on_beam", None)
-
-    forget()
+@pytest.fixture(autouse=True)
+def registered_before():
+    """Leave Gymnasium's registry as it was, and forget the example, so that its next import registers it."""
+    before = dict(gym.registry)
     yield
-    forget()
+    gym.registry.clear()
+    gym.registry.update(before)
+    sys.modules.pop("ball_on_beam", None)
 
 
 def pytest_addoption(parser):

@@ -61,7 +61,6 @@ def task(file, tmp_path, monkeypatch):
     monkeypatch.setitem(TASKS.data, ID, places[ID])
     register(places[ID], id=ID)
     yield TASKS[ID]
-    del gym.registry[ID]
     for name in ("two_link_arm", "own_two_link_arm"):
         sys.modules.pop(name, None)
 
@@ -197,8 +196,6 @@ TOY = Swing.id
 @pytest.fixture
 def toy():
     register(Swing)
-    yield
-    del gym.registry[TOY]
 
 
 def test_it_is_recognised_as_a_driven_pendulum():

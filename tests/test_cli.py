@@ -27,7 +27,6 @@ ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
 ID = "PivotedBar-v0"
 FREE = pivoted_bar.SwingUpFree.id
-pytestmark = pytest.mark.usefixtures("unregistered")
 
 
 @pytest.fixture
@@ -311,13 +310,11 @@ def elsewhere(tmp_path, monkeypatch):
     """A folder to write modules into, which are forgotten afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    before = set(sys.modules), set(gym.registry)
+    before = set(sys.modules)
     yield tmp_path
-    for name in set(sys.modules) - before[0]:
+    for name in set(sys.modules) - before:
         if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
             del sys.modules[name]
-    for id in set(gym.registry) - before[1]:
-        del gym.registry[id]
     own_files.load_module.cache_clear()
 
 

@@ -124,4 +124,3 @@ def test_what_draws_nothing_shows_the_rest():
     shown = Checked(gym.make("Bare-v0").unwrapped._repr_html_())
     assert "img" not in shown.tags and "Bare-v0" in shown.text
     assert "img" not in Checked(gym.make_vec("Bare-v0", 2)._repr_html_()).tags
-    gym.registry.pop("Bare-v0")

@@ -112,25 +112,22 @@ def test_every_place_in_a_batch_has_the_same_bits():
 def test_a_refused_step_changes_no_command_and_no_reading():
     # Without rope the crane's mass matrix is singular.
     spec = lag_envs.register(own_tasks.Deliver)
-    try:
-        keywords = {"observation_noise": 0.1, "observation_every": 2, "slew": 50.0}
-        envs = gym.make_vec(spec, num_envs=3, **keywords).unwrapped
-        calm, wild = [0, 0, 1, 0, 0.1, 0], [0, 0, 0, 0, 0.3, 1]
-        shown, _ = envs.reset(seed=0, options={"state": [calm, wild, calm]})
-        before = envs.get_state().rows
-        with pytest.raises(StepRefused) as refusal:
-            envs.step(np.ones((3, 2), np.float32))
-        after = envs.get_state().rows
-        for name in ("n", "c0", "c1", "h0", "h1"):
-            assert after[name][1] == before[name][1]
-        assert after["c0"][0] > 0.0 and (after["n"] == [1, 0, 1]).all()
-        assert np.array_equal(refusal.value.results[0][1], shown[1])
-        envs.reset(seed=0, options={"state": [calm] * 3})
+    keywords = {"observation_noise": 0.1, "observation_every": 2, "slew": 50.0}
+    envs = gym.make_vec(spec, num_envs=3, **keywords).unwrapped
+    calm, wild = [0, 0, 1, 0, 0.1, 0], [0, 0, 0, 0, 0.3, 1]
+    shown, _ = envs.reset(seed=0, options={"state": [calm, wild, calm]})
+    before = envs.get_state().rows
+    with pytest.raises(StepRefused) as refusal:
         envs.step(np.ones((3, 2), np.float32))
-        rows = envs.get_state().rows
-        assert all((rows[name][[0, 2]] == after[name][[0, 2]]).all() for name in rows)
-    finally:
-        gym.registry.pop(spec)
+    after = envs.get_state().rows
+    for name in ("n", "c0", "c1", "h0", "h1"):
+        assert after[name][1] == before[name][1]
+    assert after["c0"][0] > 0.0 and (after["n"] == [1, 0, 1]).all()
+    assert np.array_equal(refusal.value.results[0][1], shown[1])
+    envs.reset(seed=0, options={"state": [calm] * 3})
+    envs.step(np.ones((3, 2), np.float32))
+    rows = envs.get_state().rows
+    assert all((rows[name][[0, 2]] == after[name][[0, 2]]).all() for name in rows)
 
 
 SINGLE = [{name: value} for name, value in ALL.items()] + [
@@ -167,17 +164,14 @@ def test_every_environment(env_id):
 @pytest.mark.parametrize("task", own_tasks.TASKS, ids=lambda task: task.id)
 def test_tasks_of_ones_own(task, monkeypatch):
     spec = lag_envs.register(task)
-    try:
-        keywords = {"observation_noise": 0.1, "observation_delay": 0.07, "push": (5.0, 0.1)}
-        if task.action:
-            keywords |= {"action_delay": (0.01, 0.1), "slew": 50.0, "lag": 0.05}
-        if task is own_tasks.Deliver:
-            keywords |= {"action_noise": {"pull": 0.2}, "randomize": {"load_mass": (0.5, 2.0)}}
-        if task is own_tasks.Drift:
-            keywords |= {"randomize": {"length": (0.5, 2.0)}}
-        played(spec, 3, 100, **keywords)
-    finally:
-        gym.registry.pop(spec)
+    keywords = {"observation_noise": 0.1, "observation_delay": 0.07, "push": (5.0, 0.1)}
+    if task.action:
+        keywords |= {"action_delay": (0.01, 0.1), "slew": 50.0, "lag": 0.05}
+    if task is own_tasks.Deliver:
+        keywords |= {"action_noise": {"pull": 0.2}, "randomize": {"load_mass": (0.5, 2.0)}}
+    if task is own_tasks.Drift:
+        keywords |= {"randomize": {"length": (0.5, 2.0)}}
+    played(spec, 3, 100, **keywords)
 
 
 # --- off ----------------------------------------------------------------------------------------------------

@@ -516,20 +516,17 @@ def test_what_overruns_its_guard_is_clipped_in_the_observation():
 @pytest.mark.slow
 def test_one_control_of_several_lags(monkeypatch):
     spec = lag_envs.register(own_tasks.Deliver)
-    try:
-        _, envs = played(spec, 3, 60, lag={"pull": 0.05}, action_delay=0.013)
-        assert envs.unwrapped.order == general.usual_order(0.05)
-        env = gym.make(spec, lag={"pull": 0.05})
-        env.reset(seed=1)
-        pull = 0.0
-        for action in np.random.default_rng(2).uniform(-1, 1, (10, 2)).astype(np.float32):
-            roped = env.unwrapped.state[env.unwrapped.scene.state_names.index("rope")] < 0.3
-            env.step(action)
-            command = 0.0 if roped else 10.0 + 10.0 * float(action[1])
-            pull, _ = behind(pull, command, 0.05, 0.05)
-            assert env.unwrapped.control == pytest.approx([20.0 * float(action[0]), pull], abs=1e-9)
-    finally:
-        gym.registry.pop(spec)
+    _, envs = played(spec, 3, 60, lag={"pull": 0.05}, action_delay=0.013)
+    assert envs.unwrapped.order == general.usual_order(0.05)
+    env = gym.make(spec, lag={"pull": 0.05})
+    env.reset(seed=1)
+    pull = 0.0
+    for action in np.random.default_rng(2).uniform(-1, 1, (10, 2)).astype(np.float32):
+        roped = env.unwrapped.state[env.unwrapped.scene.state_names.index("rope")] < 0.3
+        env.step(action)
+        command = 0.0 if roped else 10.0 + 10.0 * float(action[1])
+        pull, _ = behind(pull, command, 0.05, 0.05)
+        assert env.unwrapped.control == pytest.approx([20.0 * float(action[0]), pull], abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -62,12 +61,10 @@ def test_advice(now, said):
 
 @pytest.mark.slow
 def test_command(capsys):
-    gym.registry.pop("BallOnBeam-v0", None)
     assert main(["order", EXAMPLE, "--num-envs", "16", "--rounds", "1"]) == 0
     out = capsys.readouterr().out
     assert all(f"\n{order:5}  " in out for order in orders.ORDERS)
     assert "order" in out.splitlines()[-1]
-    del gym.registry["BallOnBeam-v0"]
 
 
 def test_command_refuses_what_has_no_series(capsys):

@@ -18,7 +18,7 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 2, 1)).astype(np.floa
 
 
 @pytest.fixture(autouse=True)
-def example(monkeypatch, unregistered):
+def example(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     for folder in (Path(__file__).parent, EXAMPLES):  # for child processes
         monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
@@ -52,7 +52,6 @@ def test_workers_take_a_class_that_stands_in_a_function():
     observations, _ = envs.reset(seed=1)
     one, _ = gym.make("OwnHere-v0").reset(seed=1)
     envs.close()
-    del gym.registry["OwnHere-v0"]
     np.testing.assert_array_equal(observations[0], one)
 
 
@@ -133,5 +132,4 @@ def test_ray():
     finally:
         ray.shutdown()
     here = roll(Here)
-    del gym.registry["OwnHere-v0"]
     np.testing.assert_array_equal(there, here)

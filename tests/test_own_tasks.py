@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import sys
 from pathlib import Path
 
 import cloudpickle
@@ -23,14 +22,10 @@ IDS = [task.id for task in own_tasks.TASKS]
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def registered():
     for task in own_tasks.TASKS:
-        gym.registry.pop(task.id, None)  # a test of files may have registered it by its file
         lag_envs.register(task)
-    yield
-    for id in IDS:
-        gym.registry.pop(id, None)
 
 
 @pytest.mark.parametrize("id", IDS)
@@ -238,7 +233,6 @@ def test_order_of_a_task():
     task = type("Calm", (own_tasks.Switched,), {"order": 10, "id": "OwnCalm-v0"})
     lag_envs.register(task)
     env = gym.make("OwnCalm-v0").unwrapped
-    del gym.registry["OwnCalm-v0"]
     copied = copy.deepcopy(env)
     for one in (env, copied):
         one.reset(seed=2)
@@ -272,5 +266,3 @@ def test_example(monkeypatch):
         "total"
     ]
     assert after == pytest.approx(before, abs=1e-14)
-    del gym.registry["BallOnBeam-v0"]
-    sys.modules.pop("ball_on_beam", None)

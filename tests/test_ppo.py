@@ -90,9 +90,6 @@ def own():
     """Register the tasks of this file."""
     for task in (Centre, Jerky, Row):
         lag_envs.register(task)
-    yield
-    for task in (Centre, Jerky, Row):
-        gym.registry.pop(task.id)
 
 
 def make_run(folder, env_id=ENV, seed=3, steps=768, **more):
@@ -337,11 +334,8 @@ def test_settings_of_another_kind_are_refused():
 def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
     settings = ppo.Settings.of(zoo_hyperparameters(ppo.NAME, ENV) | SHORT)
     lag_envs.register(pivoted_bar.SwingUpFree, id="OwnEndless-v0", duration=float("inf"))
-    try:
-        with pytest.raises(UserError, match="have no end; give it a duration"):
-            ppo.Learner("OwnEndless-v0", settings, 0, 100)
-    finally:
-        gym.registry.pop("OwnEndless-v0")
+    with pytest.raises(UserError, match="have no end; give it a duration"):
+        ppo.Learner("OwnEndless-v0", settings, 0, 100)
 
 
 def test_five_seeds_are_a_submission(tmp_path):

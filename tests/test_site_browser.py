@@ -8,7 +8,6 @@ import threading
 from functools import partial
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from browsers import serious, until
@@ -122,9 +121,7 @@ class Reach(Task):
 def own(monkeypatch):
     """Return a board of scenes that are not in the package, including one without bodies."""
     example = Path(__file__).parents[1] / "examples" / "ball_on_beam.py"
-    gym.registry.pop("BallOnBeam-v0", None)
     balance = runpy.run_path(str(example))["Balance"]
-    del gym.registry["BallOnBeam-v0"]
     shapeless = type("Shapeless", (Swing,), {"bodies": lambda self: {}})
     kinds = {"BallOnBeam-v0": balance, "Reach-v0": Reach, "Shapeless-v0": shapeless}
     boards = []

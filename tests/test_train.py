@@ -420,10 +420,8 @@ def beside_the_example(monkeypatch):
     monkeypatch.syspath_prepend(str(BALL.parent))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(BALL.parent), *filter(None, sys.path)]))
     yield
-    for name in ("ball_on_beam", "own_ball_on_beam", "own_own_tasks"):
+    for name in ("own_ball_on_beam", "own_own_tasks"):
         sys.modules.pop(name, None)
-    for env_id in ("BallOnBeam-v0", "OwnSwitched-v0", "OwnCrane-v0"):
-        gym.registry.pop(env_id, None)
 
 
 @pytest.mark.parametrize(
