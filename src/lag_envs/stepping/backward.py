@@ -16,7 +16,7 @@ from typing import Any
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
 from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress
-from lag_envs.stepping.target import GROUP, Target
+from lag_envs.stepping.target import Target
 
 
 class Backward(Series):
@@ -200,8 +200,8 @@ class Backward(Series):
         """
         found: dict[Factor, Any] = {}
         pairs = list(self.pairs.items())
-        for begin in range(0, len(pairs), GROUP):
-            some = pairs[begin : begin + GROUP]
+        for begin in range(0, len(pairs), t.group):
+            some = pairs[begin : begin + t.group]
 
             def later(i: Any, carried: Sequence, some: Sequence = some) -> list:
                 m = t.minus(order, i)  # what was found last is added last

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs.stepping.lowering import Node
 from lag_envs.stepping.matrices import matrix_times
-from lag_envs.stepping.target import GROUP, Target
+from lag_envs.stepping.target import Target
 
 if TYPE_CHECKING:
     from lag_envs.stepping.series import ExpansionStart, Factor, Series
@@ -143,11 +143,11 @@ class Certificate:
         t, order, pairs = self._t, self._order, self._series.distinct_pairs
         self._norms: dict[int, Any] = {}
         self._overlaps: dict[tuple[Factor, Factor], Any] = {}
-        for first in range(0, len(pairs), GROUP):
-            self._measure_pairs(pairs[first : first + GROUP])
+        for first in range(0, len(pairs), t.group):
+            self._measure_pairs(pairs[first : first + t.group])
         alone = [slot for slot in range(self._series.slots) if slot not in self._norms]
-        for first in range(0, len(alone), GROUP):
-            some = alone[first : first + GROUP]
+        for first in range(0, len(alone), t.group):
+            some = alone[first : first + t.group]
 
             def accumulate(k: Any, carried: Sequence, some: Sequence = some) -> list:
                 return [t.add(total, self._size(slot, k)) for slot, total in zip(some, carried, strict=True)]

@@ -16,7 +16,13 @@ import numpy as np
 
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import LaneLayout, compile_attempt, compile_pull, compile_series_tangent
+from lag_envs.stepping.machine import (
+    LaneLayout,
+    compile_attempt,
+    compile_pull,
+    compile_series_tangent,
+    registers,
+)
 from lag_envs.stepping.series import TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
@@ -116,9 +122,12 @@ def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE, fused: b
 
 
 def lanes(record: SeriesRecord) -> int:
-    """Return how many lanes are stepped at once: as many as find room in the nearest cache."""
-    slots = Series(record).slots
-    return 16 if slots < 8 else 8 if slots < 24 else 4
+    """Return how many lanes are stepped at once: as a register holds, if the nearest cache has room.
+
+    Small series have registers to spare.
+    """
+    slots, doubles = Series(record).slots, registers().doubles
+    return max(4, 2 * doubles if slots < 8 else doubles if slots < 24 else doubles // 2)
 
 
 @cache

@@ -43,6 +43,7 @@ class DualTarget:
 
     def __init__(self, target: Any, wide: Any, broadcast: Callable, tangents: Mapping[str, Any]) -> None:
         self._t, self._wide, self._broadcast, self._tangents = target, wide, broadcast, tangents
+        self.group = wide.group
 
     def number(self, value: float) -> DualNumber:
         return DualNumber(self._t.number(value))

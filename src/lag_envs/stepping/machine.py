@@ -7,9 +7,10 @@ import inspect
 import sys
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.extending import intrinsic
 
@@ -64,6 +65,24 @@ class LaneLayout:
         self.rows = self.bounds + 2 * n
 
 
+class Registers(NamedTuple):
+    """How many vector registers the processor has, and how many doubles one of them holds."""
+
+    count: int
+    doubles: int
+
+
+@cache
+def registers() -> Registers:
+    """Return the vector registers of this processor."""
+    features = get_host_cpu_features()
+    if features.get("avx512f"):
+        return Registers(32, 8)
+    if features.get("avx2"):
+        return Registers(16, 4)
+    return Registers(32 if features.get("neon") else 16, 2)
+
+
 class Machine:
     """The target that writes LLVM's language: numbers are doubles, or vectors of them."""
 
@@ -71,6 +90,8 @@ class Machine:
         self._b, self._fused = builder, fused
         self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
         self._lanes = lanes
+        # Each product has two sums and loads two factors; what finds no register is kept in memory.
+        self.group = max(2, registers().count // (4 * -(-lanes // registers().doubles)))
         memory = builder.alloca(self.kind, entries)
         memory.align = 8 * lanes
         self._memory = memory
@@ -247,7 +268,7 @@ class Machine:
 
 @cache
 def _version() -> str:
-    """Return a digest of the code that decides what is printed."""
+    """Return a digest of all that decides what is printed: this code, and the processor's registers."""
     modules = (
         *(algebra, backward, certificate, dual, elementary, lowering, matrices, primitives, series),
         *(target, tracing),
@@ -255,7 +276,7 @@ def _version() -> str:
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]
     )
-    return hashlib.sha256(source.encode()).hexdigest()
+    return hashlib.sha256(f"{source}{registers()}".encode()).hexdigest()
 
 
 def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:

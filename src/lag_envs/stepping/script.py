@@ -19,7 +19,7 @@ from lag_envs.stepping.driver import LARGEST_COUNT, SMALLEST_PART
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series, StepProgress
-from lag_envs.stepping.target import elementary
+from lag_envs.stepping.target import GROUP, elementary
 from lag_envs.stepping.tracing import IEEE, MAGIC, Operation, TracedNumber, Value
 
 #: Every operation of a recording, in Python, JavaScript and C++. Where Python raises an error, C does not.
@@ -245,6 +245,8 @@ class Script:
     }
     <BLANKLINE>
     """
+
+    group = GROUP
 
     def __init__(self) -> None:
         self._block: list[Statement] = []

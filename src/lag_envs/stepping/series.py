@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 from lag_envs.stepping.certificate import Certificate
 from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, KNOWN, Node, SeriesRecord
 from lag_envs.stepping.matrices import Inverse, matrix_times
-from lag_envs.stepping.target import GROUP, Target
+from lag_envs.stepping.target import Target
 
 #: The orders that a series may have.
 SMALLEST_ORDER, LARGEST_ORDER = 4, 24
@@ -322,8 +322,8 @@ class Series:
         squares = [pair for pair in self.distinct_pairs if pair[0] == pair[1]]
         sums: dict = {}
         for pairs, end in ((unlike, k), (squares, t.half(k))):
-            for first in range(0, len(pairs), GROUP):
-                sums |= self._convolve_group(t, k, pairs[first : first + GROUP], end)
+            for first in range(0, len(pairs), t.group):
+                sums |= self._convolve_group(t, k, pairs[first : first + t.group], end)
         return sums
 
     def _convolve_group(self, t: Target, k: Any, pairs: Sequence[tuple[Factor, Factor]], end: Any) -> dict:

@@ -15,8 +15,7 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import FUNCTIONS, SeriesRecord
 from lag_envs.stepping.tracing import MAGIC, Operation, evaluate_operations
 
-#: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
-#: registers.
+#: How many products are summed side by side in one loop, where registers are no concern.
 GROUP = 8
 
 
@@ -49,7 +48,15 @@ def elementary(name: str, fused: bool) -> tuple[tuple[Operation, ...], str]:
 
 
 class Target(Protocol):
-    """Numbers, slots and loops; see `Plain`, the simplest one. An index is a whole number."""
+    """Numbers, slots and loops; see `Plain`, the simplest one. An index is a whole number.
+
+    Attributes
+    ----------
+    group : int
+        How many products are summed side by side in one loop. Results do not depend on it.
+    """
+
+    group: int
 
     def number(self, value: float) -> Any: ...
     def add(self, a: Any, b: Any) -> Any: ...
@@ -87,6 +94,8 @@ class Plain:
 
     On floats its results are those of the unfused print, bit for bit.
     """
+
+    group = GROUP
 
     def __init__(self, slots: int, number: Callable = float, xp: Any = None) -> None:
         self._memory: list[dict[int, Any]] = [{} for _ in range(slots)]
