@@ -200,6 +200,7 @@ def test_replanning_begins_from_what_it_is_given():
 # --- from anywhere, with kicks ---
 
 
+@pytest.mark.slow
 def test_a_recorded_plan_does_not_win_from_anywhere():
     task = chain.SwingUpAnywhere()
     agent = Tracking(task, **{name: getattr(recorded(chain.SwingUp()), name) for name in Tracking.DATA})

@@ -81,6 +81,7 @@ def test_parameters_that_are_zero(case):
     assert np.abs(alone).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_rows_and_columns_by_parameters():
     bar = PivotedBar()
     states = np.array([[0.1, 0.2, 2.0, -3.0], [0.0, 0.0, 1.0, 9.0]])

@@ -119,6 +119,7 @@ def test_several_recordings_angles_within_one_turn_and_controls_of_both_lengths(
     assert [len(x) for x in found.simulated] == [51, 51]
 
 
+@pytest.mark.slow
 def test_few_samples_on_a_finer_grid():
     states, torques = swings()
     data = np.full((401, 2), np.nan)

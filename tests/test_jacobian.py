@@ -91,7 +91,7 @@ def oracle(case):
 @pytest.mark.parametrize(
     ("kind", "n"),
     [
-        ("damped", 3),
+        slow("damped", 3),
         ("stiff", 4),
         slow("task", 3),
         *(slow(kind, 40) for kind in ("damped", "stiff")),
@@ -126,7 +126,7 @@ HEAVY = {
 
 
 #: Those that take seconds to compile or in exact arithmetic.
-LONG = ("support driven", "shell turns without gravity", "the control is the drag")
+LONG = ("shell turns", "support driven", "shell turns without gravity", "the control is the drag")
 
 
 @pytest.mark.parametrize(

@@ -475,7 +475,7 @@ def behind(u, command, lag, h):
     return command + (u - command) * left, command + (u - command) * lag * (1.0 - left) / h
 
 
-@pytest.mark.parametrize("late", [0.0, 0.013])
+@pytest.mark.parametrize("late", [slow(0.0), 0.013])
 def test_environment_against_simulate(late):
     lag, dt = 0.03, 0.02
     env = gym.make("PivotedBar-v0", lag=lag, action_delay=late)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import sympy
-from covering import every
+from covering import every, slow
 from mpmath import mp, mpf
 from reference import conditioning, flow, moving_plane, random_cases, scales
 from series_systems import SYSTEMS, acceleration
@@ -114,7 +114,7 @@ def test_linear_limit_is_exponential(decay):
         (1e5, (24, 75), 0, 0),
         (1e5, (24, 0), 3e5, 1e6),
         (2e4, (2e4, -7e5), 50, 0),
-        (1e6, (2e7, 0), 0, 0),
+        slow(1e6, (2e7, 0), 0, 0),
     ],
 )
 def test_collocation_is_the_series(gamma, field, delta, slope, monkeypatch):

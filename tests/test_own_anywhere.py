@@ -32,6 +32,7 @@ def rolled(envs):
     return np.array(seen)
 
 
+@pytest.mark.slow
 def test_workers_that_are_spawned_give_the_same_numbers():
     native = gym.make_vec(ID, num_envs=2)
     workers = gym.make_vec(ID, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"})

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from covering import slow
 from mpmath import mp, mpf
 
 from lag_envs.stepping import pendulum
@@ -86,7 +87,7 @@ def least_x(w, drive):
     return high
 
 
-@pytest.mark.parametrize("order", [14, 20])
+@pytest.mark.parametrize("order", [slow(14), 20])
 def test_bound_is_never_broken(order):
     """Truncation against a longer series in 200 random cases: at least a factor of 300 below the bound."""
     rng = np.random.default_rng(order)

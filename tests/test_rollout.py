@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from covering import covering
+from covering import covering, slow
 from rollouts import one_by_one
 
 from lag_envs.controllers import Constant, build, controllers, make_controller
@@ -140,7 +140,7 @@ def test_the_hash_holds_all_that_happens():
         (pivoted_bar.Balance.id, "zero", 0.0),
         (incline.Brake.id, "switching line", 1.0),
         (incline.Brake.id, "zero", 0.0),
-        (cylinder_in_cylinder.Tilt.id, "LQR", 1.0),
+        slow(cylinder_in_cylinder.Tilt.id, "LQR", 1.0),
         (cylinder_in_cylinder.Pump.id, "energy pump", 1.0),
         (cylinder_in_cylinder.Damping.id, "switching line", 1.0),
     ],

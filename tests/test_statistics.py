@@ -163,6 +163,7 @@ def test_point_estimates_are_those_of_rliable():
     assert pooled_iqm(*scores.T) == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::FutureWarning")  # of arch, which rliable calls
 def test_intervals_and_profile_are_those_of_rliable():
     library, metrics = rliable("library"), rliable("metrics")

@@ -469,7 +469,13 @@ HARD = {
 
 
 #: These take seconds.
-LONG = ("plane that turns fast", "drive of 1e6, hardly damped", "drive of 1e6, damped")
+LONG = (
+    "short bar, hardly damped",
+    "hoop, strong drive",
+    "plane that turns fast",
+    "drive of 1e6, hardly damped",
+    "drive of 1e6, damped",
+)
 
 
 # --- hard cases, and refusals ---

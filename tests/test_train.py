@@ -455,7 +455,10 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
-        ([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not take the hyperparameters of OwnSwitched-v0"),
+        slow(
+            [f"{SEVERAL}:Switched", "--algo", "sac"],
+            "sac does not take the hyperparameters of OwnSwitched-v0",
+        ),
         slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn needs a single control with discrete actions"),
     ],
 )

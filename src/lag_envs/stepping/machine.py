@@ -68,7 +68,7 @@ class LaneLayout:
 class Registers(NamedTuple):
     """How many vector registers the processor has, and how many doubles one of them holds."""
 
-    count: int
+    number: int
     doubles: int
 
 
@@ -91,7 +91,7 @@ class Machine:
         self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
         self._lanes = lanes
         # Each product has two sums and loads two factors; what finds no register is kept in memory.
-        self.group = max(2, registers().count // (4 * -(-lanes // registers().doubles)))
+        self.group = max(2, registers().number // (4 * -(-lanes // registers().doubles)))
         memory = builder.alloca(self.kind, entries)
         memory.align = 8 * lanes
         self._memory = memory
