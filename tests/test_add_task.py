@@ -84,7 +84,6 @@ def test_environment(task):
     assert env.target.tolist() == task.examples.start["target"]
 
 
-@pytest.mark.slow
 def test_vector_is_single(task):
     single = gym.make_vec(ID, num_envs=3, vectorization_mode="sync")
     native = gym.make_vec(ID, num_envs=3)

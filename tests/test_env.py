@@ -11,7 +11,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import PERFECT, covering, quick, slow
+from covering import PERFECT, covering
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
@@ -112,7 +112,7 @@ def test_namespace_of_the_module():
     assert run.stdout.split() == ["PivotedBar-v0"]
 
 
-@pytest.mark.parametrize("env_id", [i if i in quick() else slow(i) for i in TASKS])
+@each_id
 def test_spec_survives_json(env_id):
     some = dict(list(make(env_id).task.examples.batch.items())[:1])
     env = gym.make(env_id, dt=0.04, **{name: values[1] for name, values in some.items()})

@@ -7,7 +7,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import every, quick, slow
+from covering import covering, every, slow
 from rollouts import actions, make
 
 from lag_envs.controllers import ILQR, build, make_controller
@@ -61,7 +61,7 @@ REWARDS = {
 }
 
 
-@pytest.mark.parametrize("env_id", [i if i in quick() else slow(i) for i in REWARDS])
+@pytest.mark.parametrize("env_id", covering(REWARDS))
 def test_rewards_are_as_written_and_never_below_0(env_id):
     env = make(env_id)
     env.reset(seed=1)

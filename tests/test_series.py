@@ -460,7 +460,7 @@ def test_unfused_bits_are_those_of_plain_numbers(scene, state, control, monkeypa
 
 @pytest.mark.parametrize("system", SYSTEMS[:4], ids=NAMES[:4])
 def test_bits_do_not_depend_on_how_many_products_are_summed_side_by_side(system):
-    case = *system.draw(np.random.default_rng(9)), 0.02
+    case = (*system.draw(np.random.default_rng(9)), 0.02)
     narrow = type("Narrow", (Plain,), {"group": 2})
     assert plain_attempt(system, case, 16, 1e-12, narrow) == plain_attempt(system, case, 16, 1e-12)
 

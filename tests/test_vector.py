@@ -22,7 +22,7 @@ from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 each_id = pytest.mark.parametrize("env_id", covering())
 each_engine = pytest.mark.parametrize("env_id", covering(of=engine))
-each_single = pytest.mark.parametrize("env_id", [i if i in quick() else slow(i) for i in SINGLE])
+each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
 
@@ -164,7 +164,7 @@ def test_same_bits_where_parameters_differ(env_id, mode):
         ).all()
 
 
-@pytest.mark.parametrize("env_id", [i if i in quick() else slow(i) for i in TASKS])
+@each_id
 def test_same_bits_with_a_coarse_step(env_id):
     dt = min(10.0 * TASKS[env_id].interval, 0.2)  # more than one substep here and there
     native, sync = pair(env_id, 7, dt=dt, **lasting(env_id, 200))

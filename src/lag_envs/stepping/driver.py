@@ -122,9 +122,10 @@ def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE, fused: b
 
 
 def lanes(record: SeriesRecord) -> int:
-    """Return how many lanes are stepped at once: as a register holds, if the nearest cache has room.
+    """Return how many lanes are stepped at once.
 
-    Small series have registers to spare.
+    As many as one register holds, but at least four. Small series take two registers for each number. Large
+    ones take half of a wide register, so that they find room in the nearest cache.
     """
     slots, doubles = Series(record).slots, registers().doubles
     return max(4, 2 * doubles if slots < 8 else doubles if slots < 24 else doubles // 2)

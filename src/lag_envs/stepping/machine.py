@@ -90,7 +90,7 @@ class Machine:
         self._b, self._fused = builder, fused
         self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
         self._lanes = lanes
-        # Each product has two sums and loads two factors; what finds no register is kept in memory.
+        # A product takes four numbers: two sums and two factors. What finds no register goes to memory.
         self.group = max(2, registers().number // (4 * -(-lanes // registers().doubles)))
         memory = builder.alloca(self.kind, entries)
         memory.align = 8 * lanes
