@@ -29,7 +29,7 @@ def near(n, seed=0):
     return (torch.tensor(x, requires_grad=True) for x in (states, rng.uniform(-0.9, 0.9, (n, 1))))
 
 
-@pytest.mark.parametrize("env_id", [IDS[0], slow(IDS[1])])
+@pytest.mark.parametrize("env_id", IDS)
 def test_gradcheck(env_id, step):
     step = step if env_id == IDS[0] else Step(env_id)
     assert torch.autograd.gradcheck(lambda *given: step(*given)[:3], tuple(near(2)), rtol=1e-5)
