@@ -254,7 +254,7 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
         counted = {"rate": sum(success) / len(success), "low": low, "high": high}
     # Only the first episodes are disturbed: subtract how these differ from all anyway.
     moved = means - normalised(scale, bare[:, :few].mean(axis=1))
-    robustness = {name: _score(scale, each, moved) for name, each in (result.get("robustness") or {}).items()}
+    robustness = _scores(scale, result.get("robustness") or {}, moved)
     # With random kicks, acting more often draws different ones.
     often = 0.0 * moved if env_id in TASKS and TASKS[env_id]().draws else moved
     return {
@@ -264,8 +264,8 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
         "success": counted,
         "settle": median_time(settle) if settle else None,
         "effort": float(np.mean(effort)) if effort else None,
-        "robustness": {name: value for name, value in robustness.items() if value is not None},
-        "often": _score(scale, result.get("often"), often),
+        "robustness": robustness,
+        "often": _scores(scale, {"often": result.get("often")}, often).get("often"),
         "profile": np.column_stack([THRESHOLDS, profile(normalised(scale, bare))]).round(5).tolist(),
     }
 
@@ -275,8 +275,12 @@ def pooled(policies: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
     return [value for p in policies for value in (p.get(name) or [])]
 
 
-def _score(scale: Scale, returns: Sequence[float | None] | None, moved: Array) -> float | None:
-    """Return the score of policies' mean returns, shifted; None if one of them could not take part."""
-    if not returns or None in returns:
-        return None
-    return float(iqm(normalised(scale, np.array(returns, np.float64)) + moved))
+def _scores(
+    scale: Scale, returns: Mapping[str, Sequence[float | None] | None], moved: Array
+) -> dict[str, float]:
+    """Return the score of policies' mean returns by condition, shifted; without those that one was not in."""
+    full = {name: each for name, each in returns.items() if each and None not in each}
+    if not full:
+        return {}
+    means = normalised(scale, np.array([*full.values()], np.float64)) + moved
+    return dict(zip(full, iqm(means).tolist(), strict=True))

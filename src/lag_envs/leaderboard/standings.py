@@ -141,13 +141,16 @@ def _environment(
                 reached[agent] = AgentScore(row["score"], samples, entry.kind)
             middle, chosen = shown_episodes(result)
             verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
-            row["replays"] = [
-                replay | {"t0": 0.0, "score": float(normalised(scale, replay["return"]))}
+            # States, actions and rewards are stored rounded.
+            replays = [
+                replay
+                | rounded_data({"return": replay["return"], "score": normalised(scale, replay["return"])})
+                | {"t0": 0.0}
                 for replay in result["replays"]
                 # Under protocol 1, the episodes of random actions were different ones.
                 if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
             ]
-            rows.append(rounded_data(row))
+            rows.append(rounded_data(row) | {"replays": replays})
     return {
         "id": env_id,
         "protocol": number,
