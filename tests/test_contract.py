@@ -253,7 +253,8 @@ class Elsewhere(Scene):
     coordinates = {"x": "m", "psi": "rad"}
 
     def kinetic(self, q, v, xp):
-        return 0.5 * v.x**2 + 0.5 * ((q.x - self.where) ** 2 + 0.01) * v.psi**2
+        across = (q.x - self.where) * v.psi
+        return 0.5 * v.x**2 + 0.5 * (across**2 + 0.01 * v.psi**2)
 
     def potential(self, q, xp):
         out = q.x - self.where

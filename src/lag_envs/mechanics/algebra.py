@@ -183,7 +183,8 @@ class Expr:
 
     def __mul__(self, other: Any) -> Expr:
         second = Expr.of(other)
-        return self**2 if self._keeps(2) and self.same(second) else _expanded(self, second)
+        kept = self._kept(2) if self.same(second) else None
+        return _expanded(self, second) if kept is None else kept
 
     __rmul__ = __mul__
 
@@ -207,8 +208,9 @@ class Expr:
                 "powers: write xp.exp(p * xp.log(x)) for others"
             )
         n = int(exponent)
-        if self._keeps(n):
-            return Expr({((Atom("function", "sum", self), n),): 1})
+        kept = self._kept(n)
+        if kept is not None:
+            return kept
         base = self if n >= 0 else self.reciprocal()
         result = Expr.of(1)
         for bit in bin(abs(n))[2:]:
@@ -220,13 +222,29 @@ class Expr:
     def __rpow__(self, base: Any) -> NoReturn:
         raise FormulaError(f"{base!r} is raised to a recorded power; write xp.exp(x * {base!r}'s logarithm)")
 
-    def _keeps(self, exponent: int) -> bool:
-        """Return whether a power of this is kept as it is.
+    def _kept(self, exponent: int) -> Expr | None:
+        """Return a power of this that is kept as it is, or None if the power is expanded.
 
-        (x - c)⁴ expanded would be a small difference of large numbers where x is near c. A square is expanded
-        if terms of it may meet others: in a kinetic energy, and by cos² + sin² = 1.
+        (x - c)⁴ expanded would be a small difference of large numbers where x is near c. A factor that all
+        terms share is taken out first: (x v - c v)² is (x - c)² v².
         """
         if exponent < 2 or len(self.terms) < 2:
+            return None
+        first, *others = (dict(monomial) for monomial in self.terms)
+        shared = {a: min([n, *(o.get(a, 0) for o in others)]) for a, n in first.items()}
+        shared = {a: n for a, n in shared.items() if n > 0}
+        rest = self * Expr({tuple((a, -n) for a, n in shared.items()): 1}) if shared else self
+        if not rest._stays(exponent):
+            return None
+        power = Expr({((Atom("function", "sum", rest), exponent),): 1})
+        return power * Expr({tuple((a, n * exponent) for a, n in shared.items()): 1})
+
+    def _stays(self, exponent: int) -> bool:
+        """Return whether this power of the sum is not expanded.
+
+        A square is expanded if terms of it may meet others: in a kinetic energy, and by cos² + sin² = 1.
+        """
+        if len(self.terms) < 2:
             return False
         moving = [a for a in self.atoms() if any(s.kind != "parameter" for s in Expr.of(a).symbols())]
         if exponent > 2:
