@@ -340,6 +340,8 @@ class SwingUpUnknown(SwingUp):
         # Whole episodes, and more of them, did better in a trial than those of 5 s.
         "off_policy": {"gradient_steps": 2, "learning_rate": "lin_2e-3"},
         "td3": {"n_timesteps": 1.5e5},
+        "sac": {"n_steps": 4, "n_timesteps": 1.5e5},
+        "tqc": {"n_steps": 4, "n_timesteps": 1.5e5},
     }  # fmt: skip
     value_iteration = None
     goal = dataclasses.replace(SwingUp.goal, rules=2)
