@@ -371,7 +371,7 @@ class Pump(_Shell):
 The greedy policy of value iteration is best. Doing nothing is a local optimum: every action costs effort
 before it pays. The PPO in one file has not escaped it; the other learners have. TD3 reaches the target energy
 as soon as the energy pump does, and then spends more effort on keeping it. PPO gets there later, except for
-one seed, and keeps the energy with less effort than TD3. SAC is not quite as good as these two.
+one seed, and keeps the energy with less effort than TD3. TQC and SAC are not quite as good as these two.
 """
 
     def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
@@ -528,7 +528,7 @@ class Damping(Task):
 The greedy policy of value iteration is best. The switching line is as good within the uncertainty of these
 episodes: it lets go, and brakes fully as soon as that leads straight to rest. PPO is near rest as much of the
 time as the switching line, but very close to rest for less of it, because its network does not resolve the
-corner of the line. SAC is worse than PPO, with far fewer steps; in a trial TD3 was worse than SAC.
+corner of the line. TQC and SAC are worse than PPO, with far fewer steps; in a trial TD3 was worse than SAC.
 """
 
     def check(self) -> None:
