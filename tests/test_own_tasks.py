@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 from pathlib import Path
 
 import cloudpickle
@@ -16,7 +17,7 @@ from rollouts import RENDERS
 import lag_envs
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes import StepRefused
-from lag_envs.tasks import Task
+from lag_envs.tasks import Task, pivoted_bar
 
 IDS = [task.id for task in own_tasks.TASKS]
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -221,11 +222,115 @@ def _mistaken(**changes):
         ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),
         ({"guard": lambda self, wanted, before, dt, xp: {"shove": 1.0}}, "there is no control 'shove'"),
         ({"bounds": lambda self: {"height": 1.0}}, "there is no observation 'height'"),
+        ({"bounds": lambda self: {"x": "far"}}, r"bounds\['x'\] must be a bound above 0 or \(low, high\)"),
+        ({"bounds": lambda self: {"x": (2.0, 1.0)}}, r"bounds\['x'\] must be .* got \(2.0, 1.0\)"),
+        ({"start": {"x": (0.0, -0.5)}}, r"start\['x'\]: a half width must not be negative"),
+        ({"target": {"x_goal": ("m", -1.0)}}, r"target\['x_goal'\]: a half width must not be negative"),
+        ({"defaults": {"load_mas": 1.0}}, "Mistaken.defaults: .*'load_mas'; did you mean load_mass?"),
+        ({"usable": {"load_mas": (0.0, 1.0)}}, "Mistaken.usable: .*'load_mas'; did you mean load_mass?"),
+        ({"interval": "short"}, "Mistaken.interval must be a real number"),
+        ({"draws": 1.5}, "Mistaken.draws must be a whole number, 0 or more, got 1.5"),
+        ({"kick": Task.kick}, "Mistaken.draws is 2, but there is no kick"),
+        ({"kick": lambda self, after, draws, xp: None}, "kick returns None; it must return changes"),
+        ({"guard": lambda self, *_: {"pull": None}}, "guard returns None; it must return numbers"),
+        (
+            {"observe": lambda self, after, target, xp: {"x": "y1"}},
+            "observe returns 'y1'; it must return num",
+        ),
+        (
+            {"reward": lambda self, b, after, *_: np.array([after.x])},
+            "reward returns array.* return a number",
+        ),
+        (
+            {"reward": lambda self, *_: np.random.default_rng().random()},
+            "something else when it is run again",
+        ),
+        ({"terminated": lambda self, after, target, xp: after.x}, "returns a number; it must return a truth"),
+        ({"terminated": lambda self, after, target, xp: None}, "returns None; it must return a truth value"),
+        ({"terminated": lambda self, after, target, xp: after.x & (after.x > 0)}, "take comparisons"),
+        ({"reward": lambda self, b, after, *a: a[-1].where(after.x, 1.0, 0.0)}, "take comparisons"),
+        ({"reward": lambda self, b, after, *_: (after.x > 0) + (b.x > 0)}, "applied to comparisons alone"),
     ],
 )
 def test_mistakes_in_a_task(changes, message):
     with pytest.raises((FormulaError, ValueError), match=message):
         _mistaken(**changes)().formulas.box()
+
+
+def test_a_kick_states_how_many_numbers_it_draws():
+    class Silent(pivoted_bar.SwingUp):
+        id = "OwnSilent-v0"
+
+        def kick(self, after, draws, xp):
+            return {"theta_dot": draws[0]}
+
+    with pytest.raises(FormulaError, match=r"Silent.kick is defined, but not how many .* write draws = 1"):
+        Silent()
+    assert type("Off", (Silent,), {"draws": 0})().draws == 0
+    assert type("On", (Silent,), {"draws": 1})().draws == 1
+
+
+def test_misspelt_names_are_noticed():
+    with pytest.warns(UserWarning, match=r"nothing uses Mistaken.terminate; did you mean terminated?"):
+        _mistaken(terminate=lambda self, after, target, xp: after.x > 1.0)()
+    with pytest.warns(UserWarning, match=r"nothing uses Sticky.disipation; did you mean dissipation?"):
+        type("Sticky", (own_tasks.Crane,), {"disipation": lambda self, q, v, u, xp: v.x**2})()
+    # A name that a formula uses is the user's own business.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _mistaken(rewards=2.0, reward=lambda self, before, after, *_: self.rewards * after.x)()
+
+
+def test_comparisons_count_as_one_and_zero():
+    class Counted(own_tasks.Deliver):
+        id = "OwnCounted-v0"
+
+        def reward(self, before, after, control, target, dt, xp):
+            return 2.0 * (after.x > 0.0) - (after.x <= 0.0) + (xp.abs(after.x) < 10.0)
+
+    class Bare(Counted):
+        id, scaled = "OwnBare-v0", False
+
+        def reward(self, before, after, control, target, dt, xp):
+            return after.x > 0.0
+
+    for kind, expected in ((Counted, {True: 3.0, False: 0.0}), (Bare, {True: 1.0, False: 0.0})):
+        env = gym.make(lag_envs.register(kind))
+        for seed in range(6):
+            env.reset(seed=seed)
+            reward = env.step(env.action_space.sample())[1]
+            assert reward == expected[bool(env.unwrapped.state[0] > 0.0)]
+
+
+def test_changed_numbers_are_used():
+    """Numbers that formulas find elsewhere, as in a notebook whose cells are run again."""
+    table = {"bonus": 1.0}
+
+    class Weighed(own_tasks.Deliver):
+        id, weights = "OwnWeighed-v0", (1.0, 10.0)
+
+        def check(self):
+            self.path = np.zeros(2000)
+            self.path[1000] = self.scene.load_mass
+
+        def reward(self, before, after, control, target, dt, xp):
+            return self.weights[0] + self.weights[1] + 100.0 * table["bonus"] + 1e3 * self.path[1000]
+
+    spec = lag_envs.register(Weighed)
+
+    def reward(**parameters):
+        env = gym.make(spec, **parameters)
+        env.reset(seed=0)
+        return env.step(env.action_space.sample())[1]
+
+    assert reward(load_mass=1.0) == 1111.0
+    assert reward(load_mass=2.0) == 2111.0
+    Weighed.weights = (2.0, 10.0)
+    assert reward(load_mass=1.0) == 1112.0
+    table["bonus"] = 2.0
+    assert reward(load_mass=1.0) == 1212.0
+    with pytest.raises(ValueError, match=r"the formulas of Weighed differ .* from self.scene"):
+        gym.make_vec(spec, num_envs=2, load_mass=[1.0, 2.0])
 
 
 def test_order_of_a_task():

@@ -1,7 +1,10 @@
 """The error that commands show without a traceback, and hints for names that do not exist."""
 
 import difflib
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from types import CodeType
+from typing import Any
 
 
 class UserError(Exception):
@@ -30,3 +33,31 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
     if close:
         return f"did you mean {' or '.join(close)}?"
     return otherwise or f"there are {', '.join(names.values())}"
+
+
+def warn_of_misspelt(kind: type, base: type) -> None:
+    """Warn of names in a class that are close to names of its base and that no method of the class uses.
+
+    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation.
+    """
+    classes = kind.__mro__[: kind.__mro__.index(base)]
+    known = [name for name in dir(base) if not name.startswith("_")]
+    used = {name for c in classes for value in vars(c).values() for name in _names_in(value)}
+    for c in classes:
+        for name in vars(c):
+            if name.startswith("_") or name in known or name in used:
+                continue
+            for meant in difflib.get_close_matches(name, known, n=1, cutoff=0.8):
+                message = f"nothing uses {c.__name__}.{name}; did you mean {meant}?"
+                warnings.warn(message, UserWarning, stacklevel=2)
+
+
+def _names_in(value: Any) -> Iterator[str]:
+    """Return the names that a method's or property's code refers to."""
+    function = getattr(value, "fget", None) or getattr(value, "func", None) or value
+    codes = [getattr(getattr(function, "__func__", function), "__code__", None)]
+    while codes:
+        code = codes.pop()
+        if isinstance(code, CodeType):
+            yield from code.co_names
+            codes += code.co_consts

@@ -687,4 +687,10 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
             "in having a finite track or a fixed target, and in zeros that a formula divides by; "
             f"got {shown(many)}"
         )
+    if len({t.formulas.key for t in tasks}) > 1:
+        raise ValueError(
+            f"the formulas of {kind.__name__} differ between the environments of a batch, got {shown(many)}: "
+            "they use numbers that the task computes from its parameters; compute them within the formulas, "
+            "from self.scene"
+        )
     return tasks

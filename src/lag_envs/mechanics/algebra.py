@@ -322,7 +322,8 @@ class Expr:
         }
         name = ufunc.__name__
         if method != "__call__" or name not in operators or options:
-            self._refuse(f"np.{name}", f"use xp.{name} where there is one")
+            known = callable(getattr(RecordedFunctions, name, None))
+            self._refuse(f"np.{name}", f"use {f'xp.{name}' if known else 'whole powers and functions of xp'}")
         operands = [Expr.of(i if isinstance(i, Expr) else _scalar(i)) for i in inputs]
         return operators[name](*operands)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.evaluation import Exact, Numeric
@@ -100,6 +101,8 @@ def _check_names(scene: Any, base: type) -> None:
         for name in (*own_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
                 raise FormulaError(f"{of}.{name} hides an attribute of every scene; choose another name")
+    if not is_own(cls):
+        warn_of_misspelt(cls, base)
     layout = layout_of(scene)
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {

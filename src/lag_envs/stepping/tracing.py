@@ -90,6 +90,8 @@ IEEE: dict[str, Callable] = _FLOAT | {
 #: What a sum becomes if its first or its second term is a product that is used nowhere else.
 FUSED = {"+": ("a*b+c", "a*b+c"), "-": ("a*b-c", "c-a*b")}
 BOOLEAN = frozenset({"<", "<=", "&", "|", "~"})
+#: Operations that take truth values.
+LOGIC = frozenset({"&", "|", "~"})
 
 
 #: The name of an earlier result, or a constant.
@@ -149,7 +151,7 @@ class TracedNumber:
         whole = not isinstance(exponent, bool) and isinstance(exponent, numbers.Real)
         if not whole or float(exponent) != int(float(exponent)):
             raise TypeError(
-                f"the power {exponent!r} is not a whole number; write xp.exp(p * xp.log(x)) for others"
+                f"the power {exponent!r} is not a whole number; write xp.sqrt(x) or xp.exp(p * xp.log(x))"
             )
         power: Any = 1.0
         for bit in bin(abs(int(float(exponent))))[2:]:
@@ -191,11 +193,23 @@ class TracedNumber:
         )
 
 
+def is_truth(value: Any) -> bool:
+    """Return whether a recorded value is true or false, and no number."""
+    if not isinstance(value, TracedNumber):
+        return isinstance(value, bool)
+    return value.op in BOOLEAN or (value.op == "where" and is_truth(value.args[1]))
+
+
 class Trace:
     """One recording: inputs, operations, and the code they make.
 
     A trace is also the ``xp`` namespace of traced formulas: ``xp.where`` means `numpy.where` on arrays and a
     recorded selection here.
+
+    Parameters
+    ----------
+    numeric : bool, default False
+        Whether all inputs are numbers; otherwise some may be truth values.
 
     Examples
     --------
@@ -206,7 +220,8 @@ class Trace:
     [Operation(name='t1', op='a*b+c', args=('a', 'b', 'b'))]
     """
 
-    def __init__(self) -> None:
+    def __init__(self, numeric: bool = False) -> None:
+        self._numeric = numeric
         self._nodes: list[TracedNumber] = []
         self._known: dict[tuple, TracedNumber] = {}
         self._zeros: set[str] = set()
@@ -220,6 +235,7 @@ class Trace:
         args = tuple(a if isinstance(a, TracedNumber | bool) else float(a) for a in args)
         if not any(isinstance(a, TracedNumber) for a in args):
             return _FLOAT[op](*args)
+        args = self._counted(op, args)
         simple = _simplify(op, args)
         if simple is not None:
             return simple
@@ -229,6 +245,28 @@ class Trace:
             self._nodes.append(node)
             self._known[key] = node
         return self._known[key]
+
+    def _counted(self, op: str, args: tuple) -> tuple:
+        """Return the arguments of an operation, with truth values as 1 or 0 where numbers are needed."""
+        conditions = args if op in LOGIC else args[: op == "where"]
+        if not all(is_truth(c) or self._may_be_truth(c) for c in conditions):
+            raise TypeError(
+                "&, |, ~ and the condition of xp.where take comparisons, such as x > 0.0, not numbers"
+            )
+        others = args[len(conditions) :]
+        truths = [is_truth(a) for a in others]
+        if not any(truths) or (op == "where" and all(truths)):
+            return args
+        if all(truths):
+            raise TypeError(
+                f"{op} is applied to comparisons alone; join them with | and &, or count one by "
+                "xp.where(condition, 1.0, 0.0)"
+            )
+        counted = (self.where(a, 1.0, 0.0) if t else a for a, t in zip(others, truths, strict=True))
+        return *conditions, *counted
+
+    def _may_be_truth(self, value: Any) -> bool:
+        return isinstance(value, TracedNumber) and value.op is None and not self._numeric
 
     def zero(self) -> TracedNumber:
         """Return a number known to be zero.

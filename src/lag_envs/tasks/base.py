@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.errors import hint
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values
 from lag_envs.scenes import picture
@@ -178,6 +179,12 @@ class Task:
             )
         asked = {name: parameters.pop(name) for name in KEYWORDS if name in parameters}
         known = list(inspect.signature(kind).parameters)
+        for mapping in ("defaults", "usable"):
+            for name in sorted(set(getattr(self, mapping)) - set(known)):
+                raise FormulaError(
+                    f"{type(self).__name__}.{mapping}: {kind.__name__} has no parameter {name!r}; "
+                    f"{hint(name, known)}"
+                )
         for name in sorted(set(parameters) - set(known)):
             options = [
                 *sorted(known),
@@ -195,10 +202,14 @@ class Task:
         self.scene = kind(**self.given)
         if self.order is not None:
             vars(self.scene)[ORDER] = check_order(f"{type(self).__name__}.order", self.order)
-        self.dt = self.interval if dt is None else check_number("dt", dt, "s")
+        of = type(self).__name__
+        interval = check_number(f"{of}.interval", self.interval, "s")
+        self.dt = interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
-        seconds = self.interval * self.steps if duration is None else duration
+        seconds = (
+            interval * check_number(f"{of}.steps", self.steps, endless=True) if duration is None else duration
+        )
         self.duration = check_number("duration", seconds, "s", endless=True)
         if not self.duration >= self.dt:
             raise ValueError(f"duration must be at least dt={self.dt:g} s, got {self.duration:g} s")

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import hashlib
+import itertools
 import math
+import numbers
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
@@ -22,6 +26,7 @@ from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.stepping.general import stepper_of
+from lag_envs.stepping.tracing import TracedNumber, is_truth
 
 if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
@@ -144,12 +149,23 @@ class TaskFormulas:
         self.target_boxes = _target_boxes(task)
         self.targets = len(self.target_boxes)
         self.draws = task.draws
+        if type(self.draws) is not int or self.draws < 0:
+            raise FormulaError(
+                f"{type(task).__name__}.draws must be a whole number, 0 or more, got {task.draws!r}"
+            )
         self.starts = _starts(task)
         self.has_last = type(task).last_reward is not base.last_reward
         known = _checked.setdefault(type(task), {})
         key = self.key
-        if key not in known or not is_own(type(task)):
-            known[key] = self._names(), self._chances
+        if key not in known:
+            _check_definition(task, base)
+            names, code = self._recorded()
+            if self._recorded()[1] != code:
+                raise FormulaError(
+                    f"{type(task).__name__}: a formula gives something else when it is run again; it may "
+                    "depend on its arguments and on parameters only, not on time or chance"
+                )
+            known[key] = names, self._chances
         self.observation, self._chances = known[key]
 
     # --- constants ------------------------------------------------------------------------------------------
@@ -183,14 +199,15 @@ class TaskFormulas:
     @property
     def key(self) -> tuple:
         """What determines the code: tasks of a class that agree in it differ only in their numbers."""
-        scene = self._task.scene
         kind = type(self._task)
-        formulas = tuple(getattr(kind, name) for name in FORMULAS)
         plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
-        # Formulas may also use attributes of the task that were set by hand.
-        own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
-        shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
-        return scene.mechanics.key, self._task.variant, formulas, *plain, *own, *shared
+        if is_own(kind):
+            # Its formulas use nothing else but attributes, which may have been set by hand.
+            own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
+            formulas: Any = (*(getattr(kind, name) for name in FORMULAS), *own)
+        else:
+            formulas = self._recorded()
+        return self._task.scene.mechanics.key, self._task.variant, formulas, *plain
 
     def refusal(self, state: Any, control: Any, dt: float, where: str) -> StepRefused:
         """Return the error for a step that was refused."""
@@ -307,15 +324,16 @@ class TaskFormulas:
         xp = self._known(xp, y, z)
         before, after = self.named_state(y), self.named_state(z)
         value = self._call(name, k, before, after, self._applied(u), self.named_targets(g), k.dt, xp)
-        if value is None or isinstance(value, Mapping | Sequence):
-            raise FormulaError(
-                f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number"
-            )
-        return k.scale * value if self._task.scaled else value
+        array = isinstance(value, np.ndarray) and isinstance(k.scale, TracedNumber)
+        if value is None or array or isinstance(value, Mapping | Sequence):
+            self._refuse(name, value, "a number")
+        return k.scale * value if self._task.scaled else _counted(value)
 
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
         """Return the state after a kick."""
         added = self._call("kick", k, self.named_state(z), draws, self._known(xp, z))
+        if not isinstance(added, Mapping):
+            self._refuse("kick", added, "changes of the state's entries by name")
         after = dict(zip(self.state, z, strict=False))
         for name, value in added.items():
             if name not in after:
@@ -338,11 +356,11 @@ class TaskFormulas:
                 f"{type(self._task).__name__}.observe must return numbers by name, in order, "
                 f"got {found!r:.60}"
             )
-        return list(found.values())
+        return [_counted(value) for value in found.values()]
 
-    def _names(self) -> tuple[str, ...]:
-        """Run all formulas once, for their errors and for the observation's names."""
-        trace = self.trace()
+    def _recorded(self) -> tuple[tuple[str, ...], str]:
+        """Run all formulas, for their errors; return the observation's names and a digest of the code."""
+        trace = self.trace(numeric=True)
 
         class Inputs:
             def __getattr__(self, name: str) -> Any:
@@ -354,14 +372,28 @@ class TaskFormulas:
         a = [trace.inputs(f"a{i}")[0] for i in range(self.actions)]
         u = [trace.inputs(f"u{i}")[0] for i in range(self.controls)]
         g = [trace.inputs(f"g{i}")[0] for i in range(self.targets)]
-        self.control(trace, a, y, g, k)
-        self.outcome(trace, y, z, u, g, k)
-        if self.has_last:
-            self.last(trace, y, z, u, g, k)
-        if self.draws:
-            self.kick(trace, [trace.inputs(f"d{i}")[0] for i in range(self.draws)], z, k)
-        self.observe(trace, y, g, k)
-        return tuple(self._call("observe", k, self.named_state(y), self.named_targets(g), trace))
+        d = [trace.inputs(f"d{i}")[0] for i in range(self.draws)]
+        reward, ended = self.outcome(trace, y, z, u, g, k)
+        if not (is_truth(ended) or isinstance(ended, np.bool_)):
+            self._refuse("terminated", ended, "a truth value, such as after.x > 1.0")
+        found = {
+            "guard": self.control(trace, a, y, g, k),
+            "reward": [reward],
+            "last_reward": [self.last(trace, y, z, u, g, k)] if self.has_last else [],
+            "kick": self.kick(trace, d, z, k) if self.draws else [],
+            "observe": self.observe(trace, y, g, k),
+        }
+        for name, values in found.items():
+            for value in values:
+                if not isinstance(value, TracedNumber | numbers.Real | np.bool_):
+                    self._refuse(name, value, "a number" if "reward" in name else "numbers")
+        code = trace.operations([ended, *itertools.chain(*found.values())])
+        names = tuple(self._call("observe", k, self.named_state(y), self.named_targets(g), trace))
+        return names, hashlib.sha256(repr(code).encode()).hexdigest()
+
+    def _refuse(self, name: str, found: Any, wanted: str) -> NoReturn:
+        got = "a number" if isinstance(found, TracedNumber) else f"{found!r:.60}"
+        raise FormulaError(f"{type(self._task).__name__}.{name} returns {got}; it must return {wanted}")
 
     def sample_targets(self, draws: Sequence, k: Any) -> list:
         """Return targets from draws in [0, 1)."""
@@ -408,11 +440,38 @@ class TaskFormulas:
         low, high, unbounded = [], [], self._task.unbounded
         for name in self.observation:
             bound = given.get(name, unbounded)
-            pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
+            where = f"{type(self._task).__name__}.bounds[{name!r}]"
+            try:
+                pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
+                wrong = len(pair) != 2 or pair[0] > pair[1]
+            except TypeError:
+                wrong = True
+            if wrong:
+                raise FormulaError(f"{where} must be a bound above 0 or (low, high), got {bound!r:.60}")
             # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
             low.append(float(pair[0]) if pair[0] > -UNBOUNDED else -unbounded)
             high.append(float(pair[1]) if pair[1] < UNBOUNDED else unbounded)
         return low, high
+
+
+def _counted(value: Any) -> Any:
+    """Return a recorded truth value as 1 or 0, and numbers as they are."""
+    return 1.0 * value if is_truth(value) else value
+
+
+def _check_definition(task: Task, base: type[Task]) -> None:
+    """Raise a FormulaError if a task has a kick that is never used; warn of misspelt names."""
+    kind = type(task)
+    counted = any("draws" in vars(c) for c in kind.__mro__[: kind.__mro__.index(base)])
+    if kind.kick is not base.kick and not counted:
+        raise FormulaError(
+            f"{kind.__name__}.kick is defined, but not how many random numbers it takes: write draws = 1, "
+            "or however many"
+        )
+    if kind.kick is base.kick and task.draws:
+        raise FormulaError(f"{kind.__name__}.draws is {task.draws}, but there is no kick that takes them")
+    if not is_own(kind):
+        warn_of_misspelt(kind, base)
 
 
 def control_of(acting: Acting, a: Any, xp: Any) -> Any:
@@ -474,6 +533,7 @@ def _target_boxes(task: Task) -> list[TargetBox]:
         if not isinstance(given, tuple) or len(given) not in (2, 3) or not isinstance(given[0], str):
             raise FormulaError(f"{where} must be (unit, half width), got {given!r:.60}")
         *centre, half = _numbers_of(where, given[1:])
+        _check_half_width(where, half)
         found.append(TargetBox(name, given[0], centre[0] if centre else 0.0, half))
     return found
 
@@ -488,5 +548,11 @@ def _starts(task: Task) -> dict[str, tuple[float, float]]:
         if isinstance(given, tuple) and len(given) != 2:
             raise FormulaError(f"{where} must be a half width or (centre, half width), got {given!r}")
         pair = _numbers_of(where, given if isinstance(given, tuple) else (0.0, given))
+        _check_half_width(where, pair[1])
         found[name] = pair[0], pair[1]
     return found
+
+
+def _check_half_width(where: str, half: float) -> None:
+    if half < 0.0:
+        raise FormulaError(f"{where}: a half width must not be negative, got {half:g}")
