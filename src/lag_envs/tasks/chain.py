@@ -582,10 +582,11 @@ class Balance(_ChainTask):
             "critic": [64, 64],
         },
         # Large noise, kept for long, tips the bars over.
-        "td3": {
+        "off_policy": {
             "n_steps": 3, "gradient_steps": 2, "learning_rate": "lin_2e-3",
-            "policy_kwargs": {"noise": 0.15, "noise_steps": 4},
+            "policy_kwargs": {"noise_steps": 4},
         },
+        "td3": {"policy_kwargs": {"noise": 0.15}},
     }  # fmt: skip
     note = """
 The LQR is tuned for small deviations; feedback with directly optimised gains survives larger kicks.
