@@ -119,6 +119,7 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--threads", "0"], "a whole number of at least 1 is needed, got '0'"),
         (["bench", "--threads", "10000"], "--threads 10000 needs as many cores; this process may use"),
         (["bench", "--checkout", "nowhere"], "nowhere/README.md is missing"),
+        (["bench", "PivotedBar-v0", "--with", "wind=1"], "--with wind=1: got an unexpected keyword"),
         (["fly"], "invalid choice: 'fly'"),
     ],
 )

@@ -258,6 +258,13 @@ def test_hardly_determined():
     assert unbounded == math.inf  # silently: the end of an interval
 
 
+def test_at_rest():
+    """Nothing moves, so nothing is learnt; sin(π) is rounding, and no signal."""
+    still = np.tile([math.pi, 0.0], (100, 1))
+    with pytest.raises(ValueError, match="do not determine length"):
+        Pendulum(mass=0.3, length=0.8, damping=0.01).fit([(still, None, 0.02)], ["length"])
+
+
 def test_at_the_end_of_its_range():
     free = motion(rod, ROD | {"damping": 0.0}, [2.0, 0.0], np.zeros(60))
     for seed in range(4):  # in half of the data, noise looks like negative damping

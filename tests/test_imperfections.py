@@ -532,6 +532,11 @@ def test_noise_on_what_does_not_exist_is_refused():
             own_tasks.Drift(**{keyword: 0.1})
 
 
+def test_slew_of_several_controls_is_a_sequence_of_any_kind():
+    first, second = (own_tasks.Deliver(slew=rates) for rates in ([1.0, 2.0], np.array([1.0, 2.0])))
+    assert first.imperfections == second.imperfections
+
+
 def test_a_misspelt_keyword_is_answered_with_those_that_exist():
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'observation_nois'.*observation_noise"):
         gym.make(ID, observation_nois=0.1)
@@ -542,6 +547,9 @@ def test_a_parameter_that_an_attribute_follows_from_is_refused():
         def check(self):
             super().check()
             self.heavy = self.scene.mass * 2.0
+
+        def reward(self, before, after, *others):
+            return self.heavy * super().reward(before, after, *others)
 
     with pytest.raises(ValueError, match="an attribute that it computes from parameters"):
         LagrangianVectorEnv(Stale, 1, randomize={"mass": (0.5, 2.0)})

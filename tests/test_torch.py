@@ -156,6 +156,8 @@ def test_errors(step):
         step(states.numpy(), actions)
     with pytest.raises(ValueError, match=r"actions must have shape \(2, 1\), got \(2,\)"):
         step(states, actions[:, 0])
+    with pytest.raises(ValueError, match=r"actions must have shape \(1,\), got \(5, 1\)"):
+        step(torch.zeros(4), torch.zeros(5, 1))
     with pytest.raises(ValueError, match=r"states must have shape \(..., 4\), got \(2, 3\)"):
         step(states[:, :3], actions)
     with pytest.raises(TypeError, match=r"states must be float32 or float64, got torch\.int64"):

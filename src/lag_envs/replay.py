@@ -125,11 +125,13 @@ def read_link(link: str) -> Drive:
     if len(fields) != 7:
         raise LinkError(f"the link is damaged: it has {len(fields)} fields, not 7; copy all of it")
     before, _, check = text.rpartition("~")
-    if check != f"{zlib.crc32(before.encode()):08x}":
+    if check != f"{zlib.crc32(before.encode(errors='replace')):08x}":
         raise LinkError("the link is damaged: its checksum does not match; copy all of it again")
     _, id, seed, keys, claimed, step, _ = fields
-    if not re.fullmatch(r"\d{1,20}", seed) or int(seed) >= 2**64:
-        raise LinkError(f"the link's seed must be a whole number below 2^64, got {_short(seed)}")
+    if not re.fullmatch(r"0|[1-9][0-9]{0,19}", seed) or int(seed) >= 2**64:
+        raise LinkError(
+            f"the link's seed must be a whole number below 2^64, without leading zeros, got {_short(seed)}"
+        )
     if not re.fullmatch(r"[0-9a-f]{16}", claimed):
         raise LinkError(f"the link's return must be 16 hexadecimal digits, got {_short(claimed)}")
     if not re.fullmatch(r"[0-9a-f]{8}", step):

@@ -121,14 +121,14 @@ class Step:
         n_state, n_actions, n_targets = self._sizes
         _check("states", states, (n_state,))
         shape = states.shape[:-1]
-        _check("actions", actions, (*shape, n_actions))
+        _check("actions", actions, (*shape, n_actions), whole=True)
         if targets is None:
             fixed = self.task.fixed_target
             if n_targets and fixed is None:
                 raise ValueError("the task's target is random: targets must be given")
             given = torch.as_tensor(np.zeros(0) if fixed is None else np.asarray(fixed, np.float64))
             targets = given.reshape(n_targets).expand(*shape, n_targets)
-        _check("targets", targets, (*shape, n_targets))
+        _check("targets", targets, (*shape, n_targets), whole=True)
         rows = (x.reshape(shape.numel(), x.shape[-1]) for x in (states, actions, targets))
         found = _RowStep.apply(self.model, *rows)
         return StepResult(*(x.reshape((*shape, *x.shape[1:])) for x in found))
@@ -465,7 +465,9 @@ def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> 
 
 def _checked_task(task: Any) -> Task:
     """Return a task whose steps are differentiable, or raise a ValueError."""
-    name = type(task).__name__
+    if not isinstance(task, Task):
+        raise TypeError(f"task must be an id or a Task, got {task!r:.60}")
+    name = task.id or type(task).__name__
     if task.formulas.choices:
         raise ValueError(f"{name} has a list of actions to choose from, which have no derivatives")
     if task.imperfections:
@@ -476,15 +478,18 @@ def _checked_task(task: Any) -> Task:
     return task
 
 
-def _check(name: str, x: Any, shape: tuple[int, ...]) -> None:
-    """Raise an error unless x is a tensor of real numbers on the CPU whose shape ends in this one."""
+def _check(name: str, x: Any, shape: tuple[int, ...], *, whole: bool = False) -> None:
+    """Raise an error unless x is a tensor of real numbers on the CPU of this shape.
+
+    A shape of one number is that of the last axis only, unless it is said to be the `whole` shape.
+    """
     if not isinstance(x, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
     if x.device.type != "cpu":
         raise ValueError(f"{name} must be on the CPU, got a tensor on {x.device}; call .cpu()")
     if x.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"{name} must be float32 or float64, got {x.dtype}")
-    ends = tuple(x.shape) if len(shape) != 1 else tuple(x.shape[-1:])
-    if ends != shape:
-        wanted = f"(..., {shape[0]})" if len(shape) == 1 else str(shape)
+    last = len(shape) == 1 and not whole
+    if tuple(x.shape[-1:] if last else x.shape) != shape:
+        wanted = f"(..., {shape[0]})" if last else str(shape)
         raise ValueError(f"{name} must have shape {wanted}, got {tuple(x.shape)}")

@@ -103,6 +103,8 @@ def run_bench(args: argparse.Namespace) -> int:
         raise UserError(f"--threads {args.threads} needs as many cores; this process may use {cores}")
     if args.threads > 1 and args.clock == "cpu":
         raise UserError("--threads needs --clock wall: cpu adds up the time of all threads")
+    for text in args.keywords or ():
+        _check_keywords(text, ids)
     quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
     given = {
         name: getattr(args, name)
@@ -154,6 +156,22 @@ def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     for name in names:
         ids += own_files.registered(name) if name in files else [known_id(name)]
     return tuple(dict.fromkeys(ids)), files
+
+
+def _check_keywords(text: str, ids: Sequence[str]) -> None:
+    """Refuse keywords that none of the environments takes."""
+    import gymnasium as gym
+
+    from lag_envs.benchmark.contestants import keywords_of
+
+    for env_id in ids:
+        try:
+            gym.make(env_id, **keywords_of(text)).close()
+        except (TypeError, ValueError) as error:
+            refused = error
+        else:
+            return
+    raise UserError(f"--with {text}: {refused}") from refused
 
 
 def _check_writable(path: Path) -> None:

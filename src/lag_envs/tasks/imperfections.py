@@ -276,7 +276,7 @@ def _action_delay(task: Task, value: Any) -> dict[str, Any]:
 
 def _slew(task: Task, value: Any) -> dict[str, Any]:
     names = [a.control for a in task.formulas.acting]
-    if value == math.inf:
+    if np.ndim(value) == 0 and value == math.inf:
         return {}
     rates = _numbers("slew", value, names, "control that actions set", math.inf)
     for name, rate in zip(names, rates, strict=True):

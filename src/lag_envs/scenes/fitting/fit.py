@@ -35,6 +35,8 @@ CLOSING = (0.03, 1e-3)
 COARSE, FINE = 1e-4, 1e-12
 #: Noise is at least this part of a state's range, to allow for rounding and for errors of simulated data.
 LEAST_NOISE = 1e-9
+#: A range below this, or below the part above of the values, is rounding: nothing moves.
+LEAST_RANGE = 1e-12
 #: A standard error above this part of the estimate, or a correlation above this, causes a warning.
 WIDE, CORRELATED = 0.5, 0.999
 #: Residuals this many times the noise are a misfit; residuals below this part of the range do not matter.
@@ -102,8 +104,9 @@ class _Sizes:
         self.seen = np.any([r.measured.any(axis=0) for r in data], axis=0)
         self.count = int(sum(r.measured.sum() for r in data))
         self.guesses = [guess(scene, recording) for recording in data]
-        self.range = np.ptp(np.concatenate(self.guesses), axis=0)
-        self.range[self.range == 0.0] = 1.0
+        values = np.concatenate(self.guesses)
+        self.range = np.ptp(values, axis=0)
+        self.range[self.range <= np.maximum(LEAST_RANGE, LEAST_NOISE * np.abs(values).max(axis=0))] = 1.0
         self.noise, self.given = self.range.copy(), noise is not None
         for name, value in (noise or {}).items():
             if name not in scene.state_names:

@@ -203,7 +203,7 @@
       throw new Error("The link is damaged; copy it once more, whole.");
     }
     if (id !== about.id) throw new Error(`The link is of another environment, ${id}.`);
-    if (!/^\d{1,20}$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed)) {
+    if (!/^(0|[1-9]\d{0,19})$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed)) {
       throw new Error("The link is forged: a field is not what it must be.");
     }
     if (digest !== about.digest) throw new Error("The drive was made with another version of this environment.");
