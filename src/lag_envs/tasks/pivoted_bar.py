@@ -359,7 +359,8 @@ class SwingUpUnknown(SwingUp):
     note = """
 The adaptive controller is best: it estimates length and friction while the bar moves, and takes the delay of
 actions into account. Energy shaping with the LQR is designed for the nominal bar, and fails with much longer
-or shorter ones.
+or shorter ones. The learners see one observation at a time and cannot infer the bar. The PPO in one file is
+the best of them, with far more steps than SAC, TD3 and TQC.
 """
 
 
