@@ -719,7 +719,7 @@ def test_making_again_derives_nothing(env_id, monkeypatch):
 
     monkeypatch.setattr("lag_envs.mechanics.motion.derive_motion", refuse)
     monkeypatch.setattr("lag_envs.mechanics.recording.record_scene", refuse)
-    monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._names", refuse)
+    monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._recorded", refuse)
     make(env_id, **others)
 
 

@@ -38,12 +38,13 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
 def warn_of_misspelt(kind: type, base: type) -> None:
     """Warn of names in a class that are close to names of its base and that no method of the class uses.
 
-    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation.
+    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation. Classes of
+    this package that it is derived from are left out.
     """
     classes = kind.__mro__[: kind.__mro__.index(base)]
     known = [name for name in dir(base) if not name.startswith("_")]
     used = {name for c in classes for value in vars(c).values() for name in _names_in(value)}
-    for c in classes:
+    for c in (c for c in classes if not c.__module__.startswith("lag_envs.")):
         for name in vars(c):
             if name.startswith("_") or name in known or name in used:
                 continue

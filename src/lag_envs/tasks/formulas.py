@@ -202,9 +202,10 @@ class TaskFormulas:
         kind = type(self._task)
         plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
         if is_own(kind):
-            # Its formulas use nothing else but attributes, which may have been set by hand.
+            # What its formulas use besides are attributes, which may have been set by hand.
             own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
-            formulas: Any = (*(getattr(kind, name) for name in FORMULAS), *own)
+            shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
+            formulas: Any = (*(getattr(kind, name) for name in FORMULAS), *own, *shared)
         else:
             formulas = self._recorded()
         return self._task.scene.mechanics.key, self._task.variant, formulas, *plain
