@@ -291,6 +291,10 @@ class AcrobotReal(Task):
             "n_timesteps": 5e5, "n_steps": 256, "batch_size": 2048, "gamma": 0.998, "gae_lambda": 0.95,
             "reward_scale": 1.0, "noise_steps": 25,
         },
+        "off_policy": {
+            "n_timesteps": 2e5, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_1e-3",
+            "policy_kwargs": {"net_arch": [128, 128], "noise_steps": 4},
+        },
     }  # fmt: skip
     examples = Examples(
         start={"state": [2.8, -1.0, 0.3, 1.0]},

@@ -498,6 +498,7 @@ class Damping(Task):
         "ppo": {**_PPO, "n_timesteps": 8e5},
         # The reward comes near rest, some swings later.
         "off_policy": {"n_steps": 4, "learning_rate": "lin_2e-3"},
+        "td3": {"learning_rate": "lin_1e-3", "gradient_steps": 2, "policy_kwargs": {"noise": 0.3}},
     }
     value_iteration = ValueIteration(
         (
