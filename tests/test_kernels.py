@@ -293,13 +293,14 @@ def _on_any(task, num_envs, device, dtype, **options):
 def test_without_a_gpu(capsys):
     with pytest.raises(ValueError, match=r"there is no device 'cuda' here: .* or leave device out"):
         TorchVectorEnv(BAR.id, 2, device="cuda")
-    with pytest.raises(ValueError, match="device must be 'cpu' or 'cuda', got 'meta'"):
-        TorchVectorEnv(BAR.id, 2, device="meta")
+    for device in ("meta", "gpu", torch.device("mps")):
+        with pytest.raises(ValueError, match=f"device must be 'cpu' or 'cuda', got '{device}'"):
+            TorchVectorEnv(BAR.id, 2, device=device)
     with pytest.raises(ValueError, match=r"on the CPU dtype must be torch\.float64, got torch\.float32"):
         TorchVectorEnv(BAR.id, 2, dtype=torch.float32)
     for given, message in (
         (["--device", "cuda"], "--device: there is no device 'cuda' here"),
-        (["--device", "gpu"], "--device: Expected one of cpu, cuda"),
+        (["--device", "gpu"], "--device: device must be 'cpu' or 'cuda', got 'gpu'"),
         (["--device", "cuda", "--cold"], "--device goes only with"),
     ):
         assert cli.main(["bench", *given]) == 2

@@ -142,6 +142,12 @@ def test_mistakes(run):
             assert left.value.code == (0 if arguments == ["--help"] else 2)
     status, _, err = run("nonce")
     assert status == 2 and "nothing is pending" in err
+    status, _, err = run("build", "--board", "nowhere")
+    assert status == 2 and "there is no folder nowhere; --board names a board's folder" in err
+    Path("torn").mkdir()
+    Path("torn", "board.jsonl").write_text('{"event": "prot')
+    status, _, err = run("list", "--board", "torn")
+    assert status == 2 and "board.jsonl has no line but a torn one; restore it from version control" in err
     write("a")
     run("add", "a", "--nonce", "n")
     other = incline.Tilt.id

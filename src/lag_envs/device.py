@@ -6,6 +6,7 @@ tests use any C++ compiler and the CPU's memory.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -236,9 +237,9 @@ def kernel_argument(argument: Tensor | int | None) -> int:
 
 def checked_device(device: str | torch.device) -> torch.device:
     """Return an available NVIDIA GPU, with its number, or raise a ValueError."""
-    found = torch.device(device)
-    if found.type != "cuda":
+    if not re.fullmatch("cuda(:[0-9]+)?", str(device)):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {str(device)!r}")
+    found = torch.device(device)
     if torch.version.cuda is None or not torch.cuda.is_available():
         why = (
             "this PyTorch has been built without CUDA. Install one that has it, see pytorch.org,"

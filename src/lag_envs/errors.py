@@ -42,9 +42,12 @@ def warn_of_misspelt(kind: type, base: type) -> None:
     this package that it is derived from are left out.
     """
     classes = kind.__mro__[: kind.__mro__.index(base)]
+    theirs = [c for c in classes if not c.__module__.startswith("lag_envs.")]
+    if not theirs:
+        return
     known = [name for name in dir(base) if not name.startswith("_")]
     used = {name for c in classes for value in vars(c).values() for name in _names_in(value)}
-    for c in (c for c in classes if not c.__module__.startswith("lag_envs.")):
+    for c in theirs:
         for name in vars(c):
             if name.startswith("_") or name in known or name in used:
                 continue

@@ -139,7 +139,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
 
     try:
         device = checked_device(args.device)
-    except (ValueError, RuntimeError) as error:  # torch's own, if the name is not a device
+    except ValueError as error:
         raise UserError(f"--device: {error}") from error
     perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
     found = rates(perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.2, args.rounds or 9)

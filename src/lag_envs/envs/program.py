@@ -327,7 +327,12 @@ class Program:
     @property
     def _show_one(self) -> list[str]:
         """The lines that put the observation into the environment's array."""
-        return [f"obs[{j}] = {o}" for j, o in enumerate(self.o)]
+        return self._shown_one.store(self.o)
+
+    @property
+    def _shown_one(self) -> Rows:
+        """The array of the environment's observation."""
+        return Rows(self.o, "obs", "0", 1)
 
     @property
     def _start(self) -> list[str]:
@@ -348,7 +353,7 @@ class Program:
     def step_blocks(self) -> Callable:
         """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
         y, varying = self.y, [f"k_{name}" for name in self.varying]
-        lane, ordinary = "for i in range(size):", self._at("ordinary")
+        lane, ordinary = "for i in range(size):", self._load(["ordinary"])
         inputs = self._load([*varying, *y, *self.g, *self.reached, "n"])
         results = ["n", "over", "r", *self.o, *(["clock"] if self.sensing else [])]
         counted = ["clock = n"] if self.sensing else []
@@ -373,25 +378,26 @@ class Program:
             moving, move = [], [*controls, *self.fast]
             again = [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
             helpers = [self._stepper.engine()]
-        # If the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
-        special = " and not over > 0.0" if self.last else ""
+        # If the fast formula does not hold, or the last reward is special, the start is kept for another try.
+        holds = "within and not over > 0.0" if self.last else "within"
         main = [
             *inputs, *move,
             "again = n < 0.0", *self.outcome,
-            f"plain = within{special}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
+            f"plain = {holds}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
             "n = n + 1.0", *counted, "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
             *self.observe, *self._store([*y, *([] if self.general else [*self.u, *self.reaching])]),
             *self._store([*results, "ordinary"]),
         ]  # fmt: skip
-        redo = [
-            f"if {ordinary} == 0.0:",
+        special = [
+            *ordinary,
+            "if ordinary == 0.0:",
             *indent([
                 *inputs, *again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
-                f"    {self._at('over')} = 0.0",
+                *indent(self._store(["over"], ["0.0"])),
                 "else:",
                 *indent([
                     *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
@@ -399,12 +405,11 @@ class Program:
                     "if n >= k_limit:", "    over = over + 2.0",
                     *key, *self.kick, *self.move, *self.observe,
                     "if over > 0.0:", "    n = -over",
-                    *self._store([*y, *results]), *([f"{ordinary} = 1.0"] if self.sensing else []),
+                    *self._store([*y, *results]),
+                    *(self._store(["ordinary"], ["1.0"]) if self.sensing else []),
                 ]),
             ]),
-        ]  # fmt: skip
-        restart = [
-            f"if {ordinary} == 2.0:",
+            "elif ordinary == 2.0:",
             *indent([
                 *self._load([*varying, *self.g]),
                 *next_episode("first + i", "second + first + i", "last + first + i"),
@@ -414,7 +419,7 @@ class Program:
             ]),
         ]  # fmt: skip
         output = [
-            f"reward[first + i] = {self._at('r')}", f"over = {self._at('over')}",
+            *self._load(["r", "over"]), "reward[first + i] = r",
             "terminated[first + i] = (over == 1.0) | (over == 3.0)", "truncated[first + i] = over >= 2.0",
             "overs += np.uint64(over > 0.0)",
         ]  # fmt: skip
@@ -424,21 +429,19 @@ class Program:
             "second, last = np.uint64(count), np.uint64(2 * count)",
             *self._claimed([
                 self._base,
-                "slow, restarts = 0, 0",
+                "special = 0",
                 *(
                     line
                     for j, a in enumerate(self.a)
-                    for line in indented(lane, [f"{self._at(a)} = action[{self._action(j)}]"])
+                    for line in indented(lane, self._store([a], [f"action[{self._action(j)}]"]))
                 ),
                 *self._command_lanes, *moving,
                 *indented(lane, main),
-                *indented(lane, [f"slow += {ordinary} == 0.0", f"restarts += {ordinary} == 2.0"]),
-                "if slow > 0:", *indent(indented(lane, redo)),
-                "if restarts > 0:", *indent(indented(lane, restart)),
+                *indented(lane, [*ordinary, "special += ordinary != 1.0"]),
+                "if special > 0:", *indent(indented(lane, special)),
                 *self._sense_lanes,
                 *indented(lane, output),
-                # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
-                *(line for entry in self._shown for line in indented(lane, [entry])),
+                *self._show_block,
             ]),
         ]  # fmt: skip
         return compiled_lines(
@@ -457,9 +460,9 @@ class Program:
         ]  # fmt: skip
 
     @property
-    def _shown(self) -> list[str]:
-        """The lines that put the observation into the batch's array, one row per entry."""
-        return [f"obs[{j}, first + i] = {self._at(o)}" for j, o in enumerate(self.o)]
+    def _show_block(self) -> list[str]:
+        """The line that puts the observations of a block into the batch's array."""
+        return Rows(self.scratch, "par", self._scratch, BLOCK).copy(self.o, "size", "obs", "first")
 
     #: The key of the current environment's episode.
     _key = "key = ids[last + first + i]"
@@ -485,10 +488,12 @@ class Program:
     def _show_lane(self) -> list[str]:
         """The lines that show the current environment, apart from a step."""
         rows = [*(f"k_{name}" for name in self.varying), *self.y, *self.g]
-        return [
-            *self._load(rows), *self.observe,
-            *(f"obs[{j}, first + i] = {o}" for j, o in enumerate(self.o)),
-        ]  # fmt: skip
+        return [*self._load(rows), *self.observe, *self._shown_lane.store(self.o)]
+
+    @property
+    def _shown_lane(self) -> Rows:
+        """The places of the current environment's observation in the batch's array."""
+        return Rows(self.o, "obs", "first + i", "count")
 
     def _action(self, j: int) -> str:
         """Return the place of action j of the current environment in the batch's array."""
@@ -531,10 +536,11 @@ class Program:
 
     @property
     def _scratch_rows(self) -> Rows:
-        return Rows(self.scratch, "par", f"np.uint64({len(self.uniform)}) + i", BLOCK)
+        return Rows(self.scratch, "par", f"{self._scratch} + i", BLOCK)
 
-    def _at(self, row: str) -> str:
-        return (self._kept_rows if row in self.kept else self._scratch_rows).at(row)
+    @property
+    def _scratch(self) -> str:
+        return f"np.uint64({len(self.uniform)})"
 
     def _load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
         """Return the lines that read rows into variables, by default of their names."""

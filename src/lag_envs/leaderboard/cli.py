@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.board import Board
-from lag_envs.leaderboard.log import COMMIT, BoardEntry, BoardError, BoardState
+from lag_envs.leaderboard.log import (
+    COMMIT,
+    REMEDY,
+    BoardEntry,
+    BoardError,
+    BoardState,
+    parse,
+    read_log,
+)
 from lag_envs.leaderboard.pending import PendingCheck, finish
 from lag_envs.leaderboard.standings import board_data, page_data
 from lag_envs.tables import aligned
@@ -296,6 +304,8 @@ def _some(board: Board) -> BoardState:
         sound(board)  # which may know more
         raise
     if not state.entries:
+        if parse(read_log(board.log))[1]:
+            raise BoardError(f"{board.log} has no line but a torn one; {REMEDY}")
         raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
     return state
 
@@ -402,6 +412,8 @@ def _pin(args: argparse.Namespace) -> int:
 def _build(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.site.build import write_page
 
+    if not args.board.is_dir():
+        raise BoardError(f"there is no folder {args.board}; --board names a board's folder")
     write_page(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0

@@ -101,8 +101,7 @@ def _check_names(scene: Any, base: type) -> None:
         for name in (*own_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
                 raise FormulaError(f"{of}.{name} hides an attribute of every scene; choose another name")
-    if not is_own(cls):
-        warn_of_misspelt(cls, base)
+    warn_of_misspelt(cls, base)
     layout = layout_of(scene)
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {

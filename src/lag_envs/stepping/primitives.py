@@ -156,10 +156,39 @@ def write_rows(typingctx, array, first, stride, rows, numbers):  # type: ignore[
         kinds = signature.args[4]
         for i, at in enumerate(_places(context, builder, signature, args)):
             number = builder.extract_value(args[4], i)
-            builder.store(context.cast(builder, number, kinds[i], types.float64), at)
+            builder.store(context.cast(builder, number, kinds[i], signature.args[0].dtype), at)
         return context.get_dummy_value()
 
     return types.void(array, first, stride, rows, numbers), codegen
+
+
+@intrinsic(prefer_literal=True)
+def copy_rows(typingctx, array, first, stride, rows, size, table, column):  # type: ignore[no-untyped-def]
+    """Copy ``array[first + (rows[0] + k) * stride + i]``, i < size, to ``table[k, column + i]``, k < rows[1].
+
+    Two loops, whatever the number of rows: vector instructions for each row would take longer to compile. A
+    loop that wrote all rows at once would have to check them for overlap.
+    """
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        source = context.make_array(signature.args[0])(context, builder, args[0]).data
+        made = context.make_array(signature.args[5])(context, builder, args[5])
+        first, stride, size, column = (
+            context.cast(builder, args[i], signature.args[i], types.uint64) for i in (1, 2, 4, 6)
+        )
+        begin, many = (_INT(row.literal_value) for row in signature.args[3])
+        width = cgutils.unpack_tuple(builder, made.shape)[1]
+        with cgutils.for_range(builder, many) as rows:
+            row = builder.mul(builder.add(begin, rows.index), stride)
+            read = builder.gep(source, [builder.add(first, row)])
+            write = builder.gep(made.data, [builder.add(column, builder.mul(rows.index, width))])
+            with cgutils.for_range(builder, size) as entries:
+                number = builder.load(builder.gep(read, [entries.index]))
+                number = context.cast(builder, number, types.float64, signature.args[5].dtype)
+                builder.store(number, builder.gep(write, [entries.index]))
+        return context.get_dummy_value()
+
+    return types.void(array, first, stride, rows, size, table, column), codegen
 
 
 def _places(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequence) -> list[ir.Value]:
@@ -381,6 +410,7 @@ NAMES = {
     "select": select,
     "read_rows": read_rows,
     "write_rows": write_rows,
+    "copy_rows": copy_rows,
     "wide_vectors": wide_vectors,
     "address": address,
     "moved": moved,

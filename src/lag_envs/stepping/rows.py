@@ -9,6 +9,8 @@ from typing import Any
 class Rows:
     """Rows of numbers in an array: row r lies at ``array[first + r * stride]``.
 
+    To Numba each line is one step, where an index for each row would be a dozen.
+
     Parameters
     ----------
     names : sequence of str
@@ -16,18 +18,11 @@ class Rows:
     array, first : str
         As printed.
     stride : int or str
-        A number, if it is known; then indices are unsigned. (A signed one could be negative, and by NumPy's
-        rules that needs a branch.)
+        A number, if it is known.
     """
 
     def __init__(self, names: Sequence[str], array: str, first: str, stride: int | str) -> None:
         self.names, self.array, self.first, self.stride = list(names), array, first, stride
-
-    def at(self, row: str) -> str:
-        """Return the place of a row."""
-        r, stride = self.names.index(row), self.stride
-        beyond = f"np.uint64({r * stride})" if isinstance(stride, int) else f"{r} * {stride}"
-        return f"{self.array}[{self.first} + {beyond}]"
 
     def load(self, rows: Sequence[str], names: Sequence[str] | None = None) -> list[str]:
         """Return the line that reads rows into variables, by default of their names."""
@@ -36,6 +31,14 @@ class Rows:
     def store(self, rows: Sequence[str], values: Sequence[Any] | None = None) -> list[str]:
         """Return the line that writes values into rows, by default the variables of their names."""
         return [f"write_rows({self._places(rows)}, ({', '.join(map(str, values or rows))},))"] if rows else []
+
+    def copy(self, rows: Sequence[str], size: str, table: str, column: str) -> list[str]:
+        """Return the line that copies `size` numbers of successive rows into a table, from a column on."""
+        begin = self.names.index(rows[0])
+        if self.names[begin : begin + len(rows)] != list(rows):
+            raise ValueError(f"rows that are copied have to follow one another, got {list(rows)}")
+        places = f"{self.array}, {self.first}, {self.stride}, ({begin}, {len(rows)})"
+        return [f"copy_rows({places}, {size}, {table}, {column})"]
 
     def _places(self, rows: Sequence[str]) -> str:
         numbers = "".join(f"{self.names.index(row)}, " for row in rows)

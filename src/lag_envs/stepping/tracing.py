@@ -235,7 +235,7 @@ class Trace:
         args = tuple(a if isinstance(a, TracedNumber | bool) else float(a) for a in args)
         if not any(isinstance(a, TracedNumber) for a in args):
             return _FLOAT[op](*args)
-        args = self._counted(op, args)
+        args = self._as_numbers(op, args)
         simple = _simplify(op, args)
         if simple is not None:
             return simple
@@ -246,7 +246,7 @@ class Trace:
             self._known[key] = node
         return self._known[key]
 
-    def _counted(self, op: str, args: tuple) -> tuple:
+    def _as_numbers(self, op: str, args: tuple) -> tuple:
         """Return the arguments of an operation, with truth values as 1 or 0 where numbers are needed."""
         conditions = args if op in LOGIC else args[: op == "where"]
         if not all(is_truth(c) or self._may_be_truth(c) for c in conditions):

@@ -471,8 +471,7 @@ def _check_definition(task: Task, base: type[Task]) -> None:
         )
     if kind.kick is base.kick and task.draws:
         raise FormulaError(f"{kind.__name__}.draws is {task.draws}, but there is no kick that takes them")
-    if not is_own(kind):
-        warn_of_misspelt(kind, base)
+    warn_of_misspelt(kind, base)
 
 
 def control_of(acting: Acting, a: Any, xp: Any) -> Any:

@@ -16,6 +16,7 @@ from lag_envs.envs.lines import compiled_lines, indent, next_episode
 from lag_envs.envs.program import SLOW
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.lag import lagged_stepper
+from lag_envs.stepping.rows import Rows
 from lag_envs.tasks.base import Task
 
 
@@ -29,6 +30,8 @@ class DividedProgram(DrawnProgram):
         super().__init__(task, absent, varying)
         self.scratch = [*self.a, *self.o, *self.held]
         self._where = RowsWithRings(self.kept, "f", "base", "stride")
+        self._lane = Rows(self.kept, "f", "base", BLOCK)
+        self._work = Rows(self.scratch, "work", "0", 1)
 
     @property
     def _printed(self) -> list[str]:
@@ -75,19 +78,18 @@ class DividedProgram(DrawnProgram):
 
         `work` holds the action; it receives the shown observation, or the controls of a refused step.
         """
-        n_act, rows, actuators, sensors = len(self.a), self._where, self._actuators, self._sensors
+        rows, actuators, sensors = self._where, self._actuators, self._sensors
         body = [
             *self._parameters(),
             *rows.load([*self._rows_of_constants, *self.y, *self.g, *actuators.reached, "n"]),
-            *(f"a{i} = work[{i}]" for i in range(n_act)),
-            *actuators.perturb, *actuators.send(rows), *self._through,
+            *self._work.load(self.a), *actuators.perturb, *actuators.send(rows), *self._through,
             *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
             "n = n + 1.0", *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
             *sensors.read(rows),
-            *(f"work[{n_act + i}] = {rows.at(h)}" for i, h in enumerate(sensors.shown)),
+            *rows.load(sensors.shown), *self._work.store(self.o, sensors.shown),
             *rows.store([*self.y, *actuators.reached, "n"]),
-            *(f"{rows.at(u)} = last_{u}" for u in self.u),
+            *rows.store(self.u, [f"last_{u}" for u in self.u]),
             "return r, np.int64(over)",
         ]  # fmt: skip
         advance = self._lagged.compile() if self._lagged else self.advance
@@ -100,8 +102,7 @@ class DividedProgram(DrawnProgram):
         move = [
             "h = end - t", *motion.move,
             "if status < 0:",
-            *(f"    work[{len(self.a) + len(self.o) + j}] = {u}" for j, u in enumerate(self.u)),
-            f"    return 0.0, {SLOW}",
+            *indent([*self._work.store(self.held, self.u), f"return 0.0, {SLOW}"]),
             *motion.behind,
             *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
             "t = end",
@@ -162,9 +163,9 @@ class DividedProgram(DrawnProgram):
         first, n = len(self.kept), len(self.a)
         body = [
             "memory = f", *self._slices(first + len(self.scratch), first),
-            *(f"work[{i}] = {'a' if n == 1 else f'a[{i}]'}" for i in range(n)),
+            *self._work.store(self.a, ["a"] if n == 1 else [f"a[{i}]" for i in range(n)]),
             "r, over = take(f, np.int64(0), np.int64(1), par, work, room, ids[2])",
-            *(f"obs[{j}] = work[{n + j}]" for j in range(len(self.o))),
+            *self._work.load(self.o), *self._shown_one.store(self.o),
             "return r, over",
         ]  # fmt: skip
         return compiled_lines("step_one", "f, obs, a, ids", body, self.take)
@@ -176,7 +177,7 @@ class DividedProgram(DrawnProgram):
         body = [
             "memory = f", *self._slices(first + len(self.scratch), first), *next_episode("0", "1", "2"),
             "launch(f, np.int64(0), np.int64(1), par, key, state_given, target_given)",
-            *(f"obs[{j}] = f[{self.kept.index(f'h{j}')}]" for j in range(len(self.o))),
+            *self._one.load(self._sensors.shown), *self._shown_one.store(self.o, self._sensors.shown),
         ]  # fmt: skip
         return compiled_lines("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
 
@@ -190,8 +191,8 @@ class DividedProgram(DrawnProgram):
 
     @property
     def _show(self) -> list[str]:
-        at = (f"f[base + {self.kept.index(f'h{j}') * BLOCK}]" for j in range(len(self.o)))
-        return [f"obs[{j}, lane] = {h}" for j, h in enumerate(at)]
+        shown = self._sensors.shown
+        return [*self._lane.load(shown), *Rows(self.o, "obs", "lane", "count").store(self.o, shown)]
 
     @property
     def room_of_all(self) -> int:
@@ -202,16 +203,14 @@ class DividedProgram(DrawnProgram):
     def step_blocks(self) -> Callable:
         """See `Program.step_blocks`."""
         n, stride = len(self.a), f"np.int64({BLOCK})"
-        held = n + len(self.o)
         step = [
-            *(f"work[{j}] = action[lane * {n} + {j}]" for j in range(n)),
+            *self._work.store(self.a, [f"action[lane * {n} + {j}]" for j in range(n)]),
             f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
             f"if over == {SLOW}:",
             "    refused, over = max(refused, np.uint64(lane + 1)), 0",
-            *(f"    {self._at_lane(u)} = work[{held + j}]" for j, u in enumerate(self.u)),
+            *indent([*self._work.load(self.held), *self._lane.store(self.u, self.held)]),
             "if over > 0:",
-            f"    {self._at_lane('n')} = -np.float64(over)",
-            "    overs += np.uint64(1)",
+            *indent([*self._lane.store(["n"], ["-np.float64(over)"]), "overs += np.uint64(1)"]),
         ]
         restart = [
             *next_episode("lane", "count + lane", "2 * count + lane"),
@@ -221,7 +220,7 @@ class DividedProgram(DrawnProgram):
         body = [
             "memory = par", *self._slices(0, len(self.uniform)),
             *self._claimed(self._each([
-                f"if {self._at_lane('n')} < 0.0:", *indent(restart), "else:", *indent(step),
+                *self._lane.load(["n"]), "if n < 0.0:", *indent(restart), "else:", *indent(step),
                 "reward[lane] = r",
                 "terminated[lane] = (over == 1) | (over == 3)", "truncated[lane] = over >= 2",
                 *self._show,
@@ -229,9 +228,6 @@ class DividedProgram(DrawnProgram):
         ]  # fmt: skip
         helpers = self.take, self.launch, *sharing.claiming()
         return compiled_lines("step_blocks", sharing.STEP_BLOCKS, body, *helpers, inner=True)
-
-    def _at_lane(self, row: str) -> str:
-        return f"f[base + {self.kept.index(row) * BLOCK}]"
 
     @cached_property
     def start_all(self) -> Callable:

@@ -91,4 +91,4 @@ class Lagged:
 
     def begin(self, rows: RowsWithRings) -> list[str]:
         """Return the lines before a step: controls begin at their previous values."""
-        return [f"{reached} = {rows.at(u)}" for reached, u in zip(self.reached, self._u, strict=True)]
+        return rows.load(self._u, self.reached)

@@ -73,4 +73,4 @@ class Sensors:
         return rows.turn(self.ring, taken, self._seen) if self.ring.slots else []
 
     def _show(self, rows: RowsWithRings) -> list[str]:
-        return [f"{rows.at(h)} = {o}" for h, o in zip(self.shown, self._o, strict=True)]
+        return rows.store(self.shown, self._o)

@@ -10,6 +10,7 @@ from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import indent, indented
 from lag_envs.stepping.compiling import BLOCK
+from lag_envs.stepping.rows import Rows
 from lag_envs.tasks.base import Task
 
 
@@ -71,7 +72,8 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _show_one(self) -> list[str]:
-        return [f"obs[{j}] = {self._single.at(h)}" for j, h in enumerate(self._sensors.shown)]
+        shown = self._sensors.shown
+        return [*self._single.load(shown), *self._shown_one.store(self.o, shown)]
 
     # --- a batch --------------------------------------------------------------------------------------------
 
@@ -94,11 +96,11 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _sense_lanes(self) -> list[str]:
-        lane, sensors, stepped = "for i in range(size):", self._sensors, f"{self._at('ordinary')} == 1.0"
+        lane, sensors, ordinary = "for i in range(size):", self._sensors, self._load(["ordinary"])
         delay, clock = sensors.delay(self._lane), self._load(["clock"], ["n"])
         shown = f"stepped & ({sensors.due})" if sensors.due else "stepped"
         sense = [
-            f"stepped = {stepped}", self._key, *clock,
+            *ordinary, "stepped = ordinary == 1.0", self._key, *clock,
             *self._load([*self.o, *self.reached, *self.reaching, *sensors.shown]), *sensors.sense,
             f"shown = {shown}",
             *(f"{h} = select(shown, {o}, {h})" for h, o in zip(sensors.shown, self.o, strict=True)),
@@ -108,7 +110,8 @@ class WholeProgram(DrawnProgram):
         return [
             *(
                 indented(lane, [
-                    f"if {stepped}:", *indent([*clock, *self._load(self.o), *delay, *self._store(self.o)]),
+                    *ordinary, "if ordinary == 1.0:",
+                    *indent([*clock, *self._load(self.o), *delay, *self._store(self.o)]),
                 ])
                 if delay
                 else []
@@ -122,8 +125,9 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _show_lane(self) -> list[str]:
-        return self._shown
+        shown = self._sensors.shown
+        return [*self._load(shown), *self._shown_lane.store(self.o, shown)]
 
     @property
-    def _shown(self) -> list[str]:
-        return [f"obs[{j}, first + i] = {self._at(h)}" for j, h in enumerate(self._sensors.shown)]
+    def _show_block(self) -> list[str]:
+        return Rows(self.kept, "f", "base", BLOCK).copy(self._sensors.shown, "size", "obs", "first")
