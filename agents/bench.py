@@ -24,7 +24,7 @@ from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import Contestant, Run, measure_rates
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import ONE_THREAD, machine
-from lag_envs.options import module_parser
+from lag_envs.options import module_parser, new_file
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
 
@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
         "examples:\n  python -m agents.bench\n  python -m agents.bench --output adapter.json",
     )
     p.add_argument("--rounds", type=int, default=15, help="samples of each (default %(default)s)")
-    p.add_argument("--output", type=Path, metavar="FILE", help="keep all samples as JSON")
+    p.add_argument("--output", type=new_file, metavar="FILE", help="keep all samples as JSON")
     return p
 
 

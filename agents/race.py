@@ -22,7 +22,7 @@ from agents.run import Run, UserError, check_env, known_name, reports_errors, te
 from lag_envs import store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
-from lag_envs.options import module_parser
+from lag_envs.options import module_parser, new_file, new_picture
 from lag_envs.scores import known_returns, score
 from lag_envs.tables import aligned
 
@@ -59,9 +59,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--first-seed", type=int, default=0, metavar="K", help="default %(default)s")
     p.add_argument("--steps", type=int, metavar="N", help="steps of each training (default n_timesteps)")
     p.add_argument(
-        "--output", type=Path, metavar="FILE", help="keep each training as a line of JSON; resumes"
+        "--output", type=new_file, metavar="FILE", help="keep each training as a line of JSON; resumes"
     )
-    p.add_argument("--picture", type=Path, metavar="FILE", help="draw scores against seconds")
+    p.add_argument("--picture", type=new_picture, metavar="FILE", help="draw scores against seconds")
     return p
 
 
@@ -206,6 +206,7 @@ def draw_scores(rows: Sequence[dict[str, Any]], file: Path) -> None:
     axes.set_title(rows[0]["env"])
     axes.grid(alpha=0.3)
     axes.legend(loc="best")
+    file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=120)
 
 

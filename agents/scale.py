@@ -31,7 +31,7 @@ from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
-from lag_envs.options import module_parser
+from lag_envs.options import module_parser, new_file
 from lag_envs.store import write_file
 from lag_envs.tasks import resolve
 from lag_envs.tasks.measured import measured_entry as of_package
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="learners' runs (default runs/)"
     )
     p.add_argument(
-        "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
+        "--output", type=new_file, metavar="FILE", help="keep the numbers as JSON, beside others' there"
     )
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or list(TASKS)
@@ -81,7 +81,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError(f"--size must lie between 1 and {BATCH}, got {args.size}")
     kept: dict[str, Any] = {}
     if args.output and args.output.exists():
-        kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
+        try:
+            kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"{args.output} cannot be read ({error!r}); remove it, or choose another --output"
+            ) from error
     for env_id in envs:
         before = kept.get(env_id, of_package(env_id))
         kept[env_id] = measure_environment(

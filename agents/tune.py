@@ -26,7 +26,7 @@ from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import machine
-from lag_envs.options import module_parser
+from lag_envs.options import module_parser, new_file
 from lag_envs.scores import score
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
@@ -203,7 +203,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--steps", type=int, help="steps of each training (default n_timesteps)")
     p.add_argument("--seeds", type=int, default=2, help="trainings with each setting (default %(default)s)")
     p.add_argument("--jobs", type=int, default=1, help="trainings at once (default %(default)s)")
-    p.add_argument("--output", type=Path, metavar="FILE", help="default agents/results/tuning/ENV.json")
+    p.add_argument("--output", type=new_file, metavar="FILE", help="default agents/results/tuning/ENV.json")
     return p
 
 

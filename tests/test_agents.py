@@ -10,7 +10,7 @@ from covering import slow
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from agents import bench, demo, ppo, report, scale
+from agents import bench, demo, ppo, race, report, scale, tune
 from lag_envs.controllers import make_controller
 from lag_envs.evaluation.rollout import play
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
@@ -231,6 +231,28 @@ def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     assert scale.main([cylinder_in_cylinder.Pump.id, "--quick"]) == 0
     assert "optimal" not in capsys.readouterr().out
     assert scale.main(["PivotedBra-v0"]) == 2 and scale.main(["--batches", "0"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        (bench, ["--output"]), (scale, [ENV, "--output"]), (tune, [ENV, "--output"]),
+        (race, [ENV, "--output"]), (race, [ENV, "--picture"]),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_written_is_named_before_the_work(command, arguments, tmp_path, capsys):
+    taken = tmp_path / "taken"
+    taken.write_text("{")
+    wrong = {taken / "new.png": "is no folder to write to", tmp_path: "is a folder"}
+    if arguments[-1] == "--picture":
+        wrong = {taken / "new.png": "is no folder to write to", taken: "a picture's name ends with .png"}
+    for file, message in wrong.items():
+        with pytest.raises(SystemExit) as left:
+            command.main([*arguments, str(file)])
+        assert left.value.code == 2 and message in capsys.readouterr().err
+    if command is scale:
+        assert scale.main([ENV, "--output", str(taken)]) == 2
+        assert "taken cannot be read" in capsys.readouterr().err and taken.read_text() == "{"
 
 
 @pytest.mark.slow

@@ -261,7 +261,7 @@ def test_a_link_is_recomputed_in_the_page(drive, link):
 IMPOSSIBLE = [
     ({"step": "00000000"}, "another version"),
     ("#drive=1~x", "damaged"),
-    slow("#drive=%E0%A4%A", "no link"),
+    slow("#drive=%E0%A4%A", "not the link of a drive"),
     slow("#drive=2~a~b~c~d~e~f", "version"),
     slow({"id": "PivotedBar-v0"}, "another environment"),
     slow({"seed": 2**64}, "forged"),

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
+from pathlib import Path
 from typing import Any
+
+PICTURES = (".png", ".svg", ".pdf")
 
 
 def module_parser(module: str, about: str | None, examples: str, **options: Any) -> argparse.ArgumentParser:
@@ -15,3 +19,26 @@ def module_parser(module: str, about: str | None, examples: str, **options: Any)
         formatter_class=argparse.RawDescriptionHelpFormatter,
         **options,
     )
+
+
+def new_file(text: str) -> Path:
+    """Return the file of an option, before hours of work are spent on what could not be written to it.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If no such file can be written. Missing folders are made when it is.
+    """
+    path = Path(text)
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        wrong = "is a folder" if path.is_dir() else f"cannot be written: {folder} is no folder to write to"
+        raise argparse.ArgumentTypeError(f"{text} {wrong}")
+    return path
+
+
+def new_picture(text: str) -> Path:
+    """Return the file of an option for a picture, like `new_file`."""
+    if Path(text).suffix not in PICTURES:
+        raise argparse.ArgumentTypeError(f"a picture's name ends with {', '.join(PICTURES)}, got {text!r}")
+    return new_file(text)

@@ -923,7 +923,7 @@
       try {
         hash = decodeURIComponent(hash);
       } catch {
-        // Left as it is, it will be reported as damaged.
+        // Left as it is, it will be refused.
       }
       verdict.textContent = "";
       if (hash.includes(MARK)) {
