@@ -529,8 +529,7 @@ class Damping(Task):
 The greedy policy of value iteration is best. The switching line is as good within the uncertainty of these
 episodes: it lets go, and brakes fully as soon as that leads straight to rest. PPO is near rest as much of the
 time as the switching line, but very close to rest for less of it, because its network does not resolve the
-corner of the line. TQC is as good as PPO within the uncertainty, with far fewer steps; SAC is worse, and in a
-trial TD3 was worse than SAC.
+corner of the line. TQC is as good as PPO within the uncertainty, with far fewer steps; SAC and TD3 are worse.
 """
 
     def check(self) -> None:
