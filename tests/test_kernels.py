@@ -296,6 +296,8 @@ def test_without_a_gpu(capsys):
     for device in ("meta", "gpu", torch.device("mps")):
         with pytest.raises(ValueError, match=f"device must be 'cpu' or 'cuda', got '{device}'"):
             TorchVectorEnv(BAR.id, 2, device=device)
+    for device in ("cpu:0", torch.device("cpu", 0)):
+        assert TorchVectorEnv(BAR.id, 2, device=device).device.type == "cpu"
     with pytest.raises(ValueError, match=r"on the CPU dtype must be torch\.float64, got torch\.float32"):
         TorchVectorEnv(BAR.id, 2, dtype=torch.float32)
     for given, message in (

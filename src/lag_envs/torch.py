@@ -189,7 +189,7 @@ class TorchVectorEnv:
         self._model: Model | None = None
         self.state = torch.empty(0)
         self._infos: dict[str, Any] = {}
-        if str(device) != "cpu":
+        if str(device) not in ("cpu", "cpu:0"):
             self.envs = found = DeviceEnvs(task, num_envs, device, dtype, **options)
             self.num_envs, self.device = found.num_envs, found.device
             self._take_spaces(found.sample)
