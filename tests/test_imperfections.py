@@ -135,6 +135,8 @@ SINGLE = [{name: value} for name, value in ALL.items()] + [
     {"action_delay": 0.033},
     {"observation_delay": 0.04},
     {"action_delay": 0.013, "observation_delay": 0.05, "observation_noise": 0.1},
+    {"observation_delay": (0.0, 0.015), "observation_every": 2, "lag": 0.02},
+    {"action_delay": (0.0, 0.05), "observation_delay": (0.02, 0.08), "observation_noise": 0.01},
 ]
 
 
@@ -300,8 +302,18 @@ slow = pytest.mark.slow
 @pytest.mark.parametrize(
     ("action_delay", "observation_delay"),
     [
-        ((0.004, 0.05), 0.027),
-        *(pytest.param(*delays, marks=slow) for delays in [(0.033, 0.027), (0.06, 0.01), (0.013, 0.04)]),
+        ((0.004, 0.05), (0.0, 0.05)),
+        *(
+            pytest.param(*delays, marks=slow)
+            for delays in [
+                ((0.004, 0.05), 0.027),
+                (0.033, 0.027),
+                (0.06, 0.01),
+                (0.013, 0.04),
+                (0.033, (0.013, 0.014)),
+                (0.0, (0.02, 0.08)),
+            ]
+        ),
     ],
 )
 def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
@@ -310,7 +322,9 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
     shown = [env.reset(seed=seed)[0]]
     task, state = own.task, own.state
     formulas, k = task.formulas, task.formulas.constants()
-    spread = action_delay if isinstance(action_delay, tuple) else (action_delay, action_delay)
+    spread, ages = (
+        delay if isinstance(delay, tuple) else (delay, delay) for delay in (action_delay, observation_delay)
+    )
     arrivals, pieces = [(0.0, 0.0)], []  # (when, which control); (when, state, control) of simulated pieces
     rng = np.random.default_rng(1)
     for n in range(60):
@@ -335,7 +349,8 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
         assert reward == pytest.approx(
             (0.5 - 0.5 * math.cos(state[2])) ** 2 - 0.02 * (mean / 5) ** 2, abs=1e-11
         )
-        seen_at = (n + 1) * dt - observation_delay
+        age = ages[0] + (ages[1] - ages[0]) * draws(seed, 1, "age", n + 1, 1)[0]
+        seen_at = (n + 1) * dt - age
         if seen_at <= 0:
             assert np.array_equal(observation, shown[0])
             continue
@@ -504,6 +519,11 @@ REFUSED = [
     ({"action_noise": {"push": 0.1}}, "no control that actions set 'push', only s_ddot"),
     ({"action_delay": -0.01}, "action_delay must be at least 0 s, got -0.01 s"),
     ({"action_delay": (0.1, 0.01)}, r"\(shortest, longest\), got \(0.1, 0.01\)"),
+    (
+        {"observation_delay": (0.1, 0.01)},
+        r"observation_delay must be \(shortest, longest\), got \(0.1, 0.01\)",
+    ),
+    ({"observation_delay": "late"}, "observation_delay must be a real number, got 'late'"),
     ({"action_delay": (0.1, 0.2, 0.3)}, "the shortest and the longest"),
     ({"action_delay": None, "slew": 0.0}, "slew must be above 0"),
     ({"slew": math.nan}, "slew must be finite, got nan"),

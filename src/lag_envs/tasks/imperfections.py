@@ -86,8 +86,8 @@ class Imperfections:
         Parameters that are drawn for each episode.
     observation_noise : tuple of float
         Standard deviation for each entry of the observation, in its unit.
-    observation_delay : float
-        Age of the observations [control steps].
+    observation_delay : tuple of float
+        Lowest and highest age of the observations [control steps]; empty for none.
     observation_every : int
         Control steps from one reading to the next.
     action_noise : tuple of float
@@ -106,7 +106,7 @@ class Imperfections:
 
     drawn: tuple[Draw, ...] = ()
     observation_noise: tuple[float, ...] = ()
-    observation_delay: float = 0.0
+    observation_delay: tuple[float, ...] = ()
     observation_every: int = 1
     action_noise: tuple[float, ...] = ()
     action_delay: tuple[float, float] = (0.0, 0.0)
@@ -123,12 +123,17 @@ class Imperfections:
     @property
     def readings(self) -> int:
         """Number of stored observations: those that are still to be shown."""
-        return 1 + math.floor(self.observation_delay) if self.observation_delay else 0
+        return 1 + math.floor(self.observation_delay[1]) if self.observation_delay else 0
+
+    @property
+    def jittered(self) -> bool:
+        """Whether the age of the observations varies."""
+        return len(set(self.observation_delay)) > 1
 
     @property
     def within(self) -> bool:
         """Whether observations are taken within a control step."""
-        return self.observation_delay % 1.0 > 0.0
+        return self.jittered or any(age % 1.0 for age in self.observation_delay)
 
     @property
     def whole(self) -> bool:
@@ -142,7 +147,7 @@ class Imperfections:
         return (
             tuple((d.name, d.log) for d in self.drawn),
             tuple(x > 0.0 for x in self.observation_noise),
-            (self.readings, self.within),
+            (self.readings, self.within, self.jittered),
             self.observation_every > 1,
             tuple(x > 0.0 for x in self.action_noise),
             self.commands,
@@ -228,6 +233,19 @@ def _seconds(keyword: str, value: Any, dt: float) -> float:
     return steps
 
 
+def _delays(keyword: str, value: Any, dt: float) -> tuple[float, float]:
+    """Return the shortest and the longest delay in control steps, from one for both or a sequence."""
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        delay = _seconds(keyword, value, dt)
+        return delay, delay
+    if len(value) != 2:
+        raise ValueError(f"{keyword} must be seconds, or the shortest and the longest, got {shown(value)}")
+    low, high = (_seconds(keyword, x, dt) for x in value)
+    if low > high:
+        raise ValueError(f"{keyword} must be (shortest, longest), got {shown(value)}")
+    return low, high
+
+
 def _observation_noise(task: Task, value: Any) -> dict[str, Any]:
     return {
         "observation_noise": _sizes("observation_noise", value, task.observation, "entry of the observation")
@@ -235,7 +253,8 @@ def _observation_noise(task: Task, value: Any) -> dict[str, Any]:
 
 
 def _observation_delay(task: Task, value: Any) -> dict[str, Any]:
-    return {"observation_delay": _seconds("observation_delay", value, task.dt)}
+    ages = _delays("observation_delay", value, task.dt)
+    return {"observation_delay": ages if any(ages) else ()}
 
 
 def _observation_every(task: Task, value: Any) -> dict[str, Any]:
@@ -259,19 +278,10 @@ def _action_noise(task: Task, value: Any) -> dict[str, Any]:
 
 
 def _action_delay(task: Task, value: Any) -> dict[str, Any]:
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        if len(value) != 2:
-            raise ValueError(
-                f"action_delay must be seconds, or the shortest and the longest, got {shown(value)}"
-            )
-        low, high = (_seconds("action_delay", x, task.dt) for x in value)
-        if low > high:
-            raise ValueError(f"action_delay must be (shortest, longest), got {shown(value)}")
-    else:
-        low = high = _seconds("action_delay", value, task.dt)
-    if high and not task.formulas.acting:
+    delays = _delays("action_delay", value, task.dt)
+    if any(delays) and not task.formulas.acting:
         raise ValueError(f"action_delay: there is no action here, got {shown(value)}; leave it out")
-    return {"action_delay": (low, high)}
+    return {"action_delay": delays}
 
 
 def _slew(task: Task, value: Any) -> dict[str, Any]:

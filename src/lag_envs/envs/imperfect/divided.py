@@ -35,10 +35,9 @@ class DividedProgram(DrawnProgram):
 
     @property
     def _printed(self) -> list[str]:
-        names = ("late_low", "late_high", "shown_at")
-        inside = (self._actuators.perturb, self._sensors.sense, [self._sensors.due])
+        inside = (self._actuators.perturb, self._sensors.sense, [self._sensors.due], self._sensors.divide)
         commands = (self._actuators.at_rest, self._actuators.command)
-        more = (*inside, *commands, [f"k_{name}" for name in names], self._motion.constants)
+        more = (*inside, *commands, ["k_late_low k_late_high"], self._motion.constants)
         return [*super()._printed, *(line for part in more for line in part)]
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
@@ -116,9 +115,9 @@ class DividedProgram(DrawnProgram):
             *indent([
                 "if t == switch:", *indent(["switch = k_dt", *commands]),
                 "end = switch",
-                *(["if t < k_shown_at < end:", "    end = k_shown_at"] if within else []),
+                *self._sensors.divide,
                 *move,
-                *(self._sensors.watch if within else []),
+                *self._sensors.watch(self._where),
             ]),
         ]  # fmt: skip
         return [

@@ -11,7 +11,7 @@ from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks.imperfections import normals
 
 #: Purposes that have draws of their own, with the numbers from which their keys are made.
-PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
+PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5, "age": 6}
 
 
 def purpose_key(purpose: str) -> str:

@@ -37,7 +37,8 @@ def numbers_of(task: Task) -> dict[str, float]:
         numbers |= {f"lagged_{name}": x for name, x in motion_constants_of(scene, lagged=True).items()}
         numbers |= {f"decay{i}": x for i, x in enumerate(found.lag)}
         numbers["lagged_order"] = step_argument_of(scene, task.dt, lagged=True)
-    numbers["shown_at"] = (1.0 - found.observation_delay % 1.0) * task.dt
+    numbers["age_low"], numbers["age_high"] = found.observation_delay or (0.0, 0.0)
+    numbers["shown_at"] = (1.0 - numbers["age_high"] % 1.0) * task.dt
     return numbers | {"every": float(found.observation_every)}
 
 

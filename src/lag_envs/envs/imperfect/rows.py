@@ -39,8 +39,12 @@ class RowsWithRings(Rows):
             f"slot = {self.whole('n')} % {slots}",
             *self.put(ring, values),
             f"slot = (slot + {self.whole(1)}) % {slots}",
-            *(f"{result} = {self.in_slot(ring, row)}" for row, result in results.items()),
+            *self.take(ring, results),
         ]
+
+    def take(self, ring: Ring, results: Mapping[str, str]) -> list[str]:
+        """Return the lines that read the values in a slot, as results by row."""
+        return [f"{result} = {self.in_slot(ring, row)}" for row, result in results.items()]
 
     def put(self, ring: Ring, values: Mapping[str, str]) -> list[str]:
         """Return the lines that write values into a slot."""

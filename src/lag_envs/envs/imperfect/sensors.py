@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lag_envs.envs.imperfect.draws import noise
+from lag_envs.envs.imperfect.draws import noise, purpose_key
 from lag_envs.envs.imperfect.rows import Ring, RowsWithRings
 from lag_envs.envs.lines import indent
 from lag_envs.stepping.tracing import Trace
@@ -41,6 +41,7 @@ class Sensors:
         trace: type[Trace],
     ) -> None:
         self._options, self._o, self._observe = options, observed, observe
+        self._low, self._high = constants["age_low"], constants["age_high"]
         every = constants["every"]
         #: Whether a reading is due after step ``n``; empty if one always is.
         self.due = f"np.floor(n / {every}) * {every} == n" if options.observation_every > 1 else ""
@@ -52,10 +53,36 @@ class Sensors:
         self.sense = [*noise(observed, "observation", sigmas, constants, trace), *bounded]
 
     @property
-    def watch(self) -> list[str]:
-        """The lines that store, within a step, what will be shown later."""
+    def divide(self) -> list[str]:
+        """The lines that end a piece of a step where an observation is taken, if that is before `end`."""
+        if self._options.jittered:
+            return self._each_coming(["if t < seen_at < end:", "    end = seen_at"])
+        return ["if t < k_shown_at < end:", "    end = k_shown_at"] if self._options.within else []
+
+    def watch(self, rows: RowsWithRings) -> list[str]:
+        """Return the lines that store, at the end of a piece, what will be shown later."""
+        if self._options.jittered:
+            slot = f"slot = (np.int64(n) + coming) % {self.ring.slots}"
+            store = [*self._observe, slot, *rows.put(self.ring, self._seen)]
+            return self._each_coming(["if t == seen_at:", *indent(store)])
         seen = [*self._observe, *(f"m{i} = {o}" for i, o in enumerate(self._o))]
-        return ["if t == k_shown_at:", *indent(seen)]
+        return ["if t == k_shown_at:", *indent(seen)] if self._options.within else []
+
+    def _each_coming(self, body: Sequence[str]) -> list[str]:
+        """Return the loop over the readings to come, each of its own age, that may be taken in this step.
+
+        One of age 0 is taken at the step's end, none at its beginning, which was the end of the last.
+        """
+        lines = [
+            "share = uniform(key_age, np.uint64(n + coming), np.uint64(0))",
+            f"seen_at = (coming - ({self._low} + ({self._high} - {self._low}) * share)) * k_dt",
+            *body,
+        ]
+        return [
+            f"key_age = {purpose_key('age')}",
+            f"for coming in range(1, {self.ring.slots + 1}):",
+            *indent(lines),
+        ]
 
     def begin(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that show a start as if it had lasted for a long time."""
@@ -69,6 +96,8 @@ class Sensors:
 
     def delay(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that replace the observation by the one to be shown now, if sensors are late."""
+        if self._options.jittered:
+            return [f"slot = np.int64(n) % {self.ring.slots}", *rows.take(self.ring, self._seen)]
         taken = {row: f"m{i}" for i, row in enumerate(self._seen)} if self._options.within else self._seen
         return rows.turn(self.ring, taken, self._seen) if self.ring.slots else []
 
