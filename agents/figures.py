@@ -46,7 +46,7 @@ def save(figure: Any, file: Path) -> None:
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
-    Image.open(buffer).convert("RGB").quantize(32).save(file, optimize=True)
+    Image.open(buffer).convert("RGB").quantize(16).save(file, optimize=True)
 
 
 def _figure(width: float, height: float) -> Any:

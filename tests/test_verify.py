@@ -363,7 +363,6 @@ def test_command_refuses_what_are_no_results(tmp_path, content):
     [
         (["--episodes", 0], "--episodes must lie"),
         (["--jobs", 0], "--jobs must be at least 1"),
-        (["--json", "/nowhere/at/all"], "there is no folder"),
     ],
 )
 def test_command_refuses(tmp_path, arguments, reason):

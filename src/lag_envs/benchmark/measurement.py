@@ -21,6 +21,7 @@ from lag_envs.benchmark.rounds import CLOCKS, measure_rates
 from lag_envs.benchmark.targets import verdicts
 from lag_envs.host import installed_versions, machine
 from lag_envs.own_files import registered
+from lag_envs.store import write_file
 from lag_envs.tasks import TASKS
 
 LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "jax", "torchrl", "torch")
@@ -83,7 +84,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         report["divisions"] = divisions(settings.ids)
     print("\n".join(report_lines(report)))
     if settings.output:
-        Path(settings.output).write_text(report_json(report), encoding="utf-8")
+        write_file(Path(settings.output), report_json(report))
         print(f"written to {settings.output}")
     if settings.checkout and complete:
         take_over(report, Path(settings.checkout))

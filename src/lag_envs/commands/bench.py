@@ -11,6 +11,7 @@ from lag_envs import TASKS
 from lag_envs.commands.base import OWN, Command, count, declare_date, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
+from lag_envs.options import new_file
 from lag_envs.own_files import is_file
 
 
@@ -29,7 +30,10 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--cold", action="store_true", help="only the cold start: import, make, reset, first step"
     )
     parser.add_argument(
-        "--output", metavar="FILE", help="write everything, raw samples included, to this JSON file"
+        "--output",
+        type=new_file,
+        metavar="FILE",
+        help="write everything, raw samples included, to this JSON file",
     )
     parser.add_argument(
         "--checkout",
@@ -86,8 +90,6 @@ def run_bench(args: argparse.Namespace) -> int:
     ids = ids or (("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS))
     if args.device:
         return _on_device(args, ids)
-    if args.output:
-        _check_writable(Path(args.output))
     if args.checkout is not None:
         if args.threads > 1 or any(getattr(args, o) for o in ("ids", "quick", "cold", "sizes", "keywords")):
             raise UserError(
@@ -122,7 +124,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "threads": args.threads,
         "clock": args.clock,
         "date": args.date,
-        "output": args.output,
+        "output": args.output and str(args.output),
         "checkout": args.checkout,
     }
     return in_own_process(BenchmarkSettings(**(quick | given | plain)))
@@ -172,16 +174,6 @@ def _check_keywords(text: str, ids: Sequence[str]) -> None:
         else:
             return
     raise UserError(f"--with {text}: {refused}") from refused
-
-
-def _check_writable(path: Path) -> None:
-    """Refuse, before the measurement, a file that could not be written after it."""
-    if path.is_dir():
-        raise UserError(f"--output must name a file, and {path} is a folder")
-    if not path.absolute().parent.is_dir():
-        raise UserError(f"--output: there is no folder {path.absolute().parent}")
-    if not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
-        raise UserError(f"--output: {path} cannot be written to")
 
 
 def _keywords(text: str) -> str:

@@ -27,6 +27,8 @@ from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import load_json
 from lag_envs.leaderboard.results import UNPACKED, checked_result, code_digest, compare_results
 from lag_envs.leaderboard.submission import Refused, Submission, load
+from lag_envs.options import new_file
+from lag_envs.store import write_file
 from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]
@@ -233,7 +235,7 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
         "--jobs", metavar="N", type=int, default=1, help="submissions to verify in parallel (default: 1)"
     )
     parser.add_argument("--ray", metavar="ADDRESS", help='spread them over a Ray cluster; "local" starts one')
-    parser.add_argument("--json", metavar="FILE", help="write all results to this file")
+    parser.add_argument("--json", type=new_file, metavar="FILE", help="write all results to this file")
     parser.add_argument(
         "--against", metavar="FILE",
         help="compare with results that --json wrote, here or elsewhere, for the same nonce and episodes",
@@ -246,8 +248,6 @@ def run_verify(args: argparse.Namespace) -> int:
         raise UserError(f"--episodes must lie between 1 and 100000, got {args.episodes}")
     if args.jobs < 1:
         raise UserError(f"--jobs must be at least 1, got {args.jobs}")
-    if args.json and not Path(args.json).absolute().parent.is_dir():
-        raise UserError(f"--json: there is no folder {Path(args.json).absolute().parent}")
     folders = [Path(folder) for folder in args.folders]
     before = _read(Path(args.against)) if args.against else None
     results, far = [], False
@@ -260,7 +260,7 @@ def run_verify(args: argparse.Namespace) -> int:
             plans = load(folder).architecture.plans
             far |= _report(result, before.get(result["digest"]), args.against, plans)
     if args.json:
-        Path(args.json).write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
+        write_file(args.json, json.dumps(results, allow_nan=False) + "\n")
     return 1 if far or any("refused" in result for result in results) else 0
 
 
