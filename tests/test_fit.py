@@ -107,6 +107,24 @@ def test_two_coordinates_of_which_only_the_places_are_measured():
     assert np.isnan(found.residuals[0][:, 1]).all() and np.isnan(found.residuals[0][42]).all()
 
 
+@pytest.mark.parametrize("start", [[2.5, 0.0], [0.5, 1.0]], ids=["from below", "from above"])
+def test_a_gyroscope_alone(start):
+    states = motion(rod, ROD, start, np.zeros(100))
+    data = noisy(states, 0.05, 4)
+    data[:, 0] = np.nan
+    found = Pendulum(mass=0.7).fit([(data, None, DT)], ["length", "damping"])
+    assert agrees(found, ROD) and found.warnings == ()
+    assert np.abs(np.sin(0.5 * (found.simulated[0] - states))[:, 0]).max() < 0.05
+
+
+def test_an_angle_of_which_only_the_rate_is_measured_on_a_cart():
+    states, forces = ride()
+    data = noisy(states, 0.01, 3)
+    data[:, 2] = np.nan
+    found = CartPole().fit([(data, forces, 0.02)], list(CART))
+    assert agrees(found, CART)
+
+
 def test_several_recordings_angles_within_one_turn_and_controls_of_both_lengths():
     states, torques = swings()
     data = noisy(states, [0.02, 0.1], 6)

@@ -56,6 +56,7 @@ def test_workers_take_a_class_that_stands_in_a_function():
     np.testing.assert_array_equal(observations[0], one)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RENDERS, reason="needs pygame")
 def test_video(tmp_path):
     env = gym.wrappers.RecordVideo(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from covering import every, slow
 
 from lag_envs.report import diagrams, peers, verdicts, work_precision
 from lag_envs.report.cases import VARIANTS, ensemble
@@ -124,7 +125,7 @@ def test_kernels_refuse_other_constants():
 # --- rivals: no form is fast because it is broken ---
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", every(2, MODES))
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -171,7 +172,7 @@ def test_libraries_are_given_the_scene(name, method):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("steps", [1, 20])
+@pytest.mark.parametrize("steps", [slow(1), 20])
 @pytest.mark.parametrize("name", VARIANTS)
 def test_heyoka(name, steps, mode):
     """Its compiled step in a loop, and propagate_until over a longer time, alone and in blocks."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from covering import covering
+from covering import covering, engine
 
 from agents import behaviour, figures, measure, report, results
 from agents.analysis import learning_curve, level, summarise_env, summarise_learners, times_to_levels
@@ -312,7 +312,7 @@ def assert_reproduced(env_id, name, policies):
         assert found.mean() == pytest.approx(stated["return"], abs=4.0 * error), name
 
 
-@pytest.mark.parametrize("env_id", covering(have("agents")))
+@pytest.mark.parametrize("env_id", covering(have("agents"), of=engine))
 def test_committed_results_of_controllers_come_out_again(env_id):
     for name, found in controllers(TASKS[env_id]).items():
         if not found.plans:  # that takes minutes

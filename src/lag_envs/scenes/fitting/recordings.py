@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: Starts that are tried for an angle whose rate alone was measured, spread over a turn.
+TRIED = 16
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
 
@@ -120,7 +122,8 @@ def guess(scene: Scene, recording: Recording) -> Array:
     """Return states near those of a recording, shape (N, n_state), with a value for each entry.
 
     Measurements are smoothed lightly, and gaps are bridged. A rate that was not measured is the slope of the
-    place; a place that was not measured is the integral of the rate from 0.
+    place; a place that was not measured is the integral of the rate from 0, or for an angle from where the
+    scene would accelerate most alike.
     """
     dt, count = recording.dt, len(recording.states)
     entries = layout_of(scene).state
@@ -130,7 +133,7 @@ def guess(scene: Scene, recording: Recording) -> Array:
         if len(seen):
             values = np.interp(np.arange(count), seen, recording.states[seen, i])
             known[entry.coordinate, entry.kind == "place"] = _parabolas(values, dt)
-    found = np.zeros((count, len(entries)))
+    found, turns = np.zeros((count, len(entries))), []
     for i, entry in enumerate(entries):
         place = entry.kind == "place"
         if (entry.coordinate, place) in known:
@@ -140,7 +143,27 @@ def guess(scene: Scene, recording: Recording) -> Array:
         elif place and (entry.coordinate, False) in known:
             rate = known[entry.coordinate, False][0]
             found[1:, i] = np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))
+            if entry.unit == "rad" and entry.coordinate in layout_of(scene).free:
+                turns.append((i, entry.coordinate))
+    for i, coordinate in turns:
+        found[:, i] += _turn(scene, recording, found, i, coordinate, known[coordinate, False][1])
     return found
+
+
+def _turn(scene: Scene, recording: Recording, states: Array, i: int, coordinate: str, slope: Array) -> float:
+    """Return the angle by which to turn entry i so that accelerations are most like the slopes of its rate.
+
+    They are compared up to a factor, since the parameters are still wrong.
+    """
+    controls = recording.controls if scene.control_names else 0.0
+
+    def likeness(angle: float) -> float:
+        turned = states[:-1].copy()
+        turned[:, i] += angle
+        found = scene.acceleration(turned, controls)[coordinate]
+        return float(slope[:-1] @ found) / max(float(np.linalg.norm(found)), np.finfo(float).tiny)
+
+    return max((2.0 * np.pi * k / TRIED for k in range(TRIED)), key=likeness)
 
 
 def _parabolas(values: Array, dt: float) -> tuple[Array, Array]:
