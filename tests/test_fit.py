@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from covering import slow
 from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
@@ -33,6 +34,22 @@ def cart(y, force, p, g=9.8):
     pull = (force - p["friction"] * y[1] + m * half * y[3] ** 2 * sin) / total
     turn = (g * sin - cos * pull) / (half * (4.0 / 3.0 - m * cos * cos / total))
     return y[1], pull - m * half * turn * cos / total, y[3], turn
+
+
+class Bob(Scene):
+    """A spherical pendulum, singular at its poles."""
+
+    drag: float = parameter(0.1, "N m s", least=0.0)
+    coordinates = {"a": "rad", "p": "rad"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.a**2 + (xp.sin(q.a) * v.p) ** 2)
+
+    def potential(self, q, xp):
+        return 9.81 * xp.cos(q.a)
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.drag * v.a**2
 
 
 def motion(rates, parameters, start, controls, dt=DT):
@@ -123,6 +140,25 @@ def test_an_angle_of_which_only_the_rate_is_measured_on_a_cart():
     data[:, 2] = np.nan
     found = CartPole().fit([(data, forces, 0.02)], list(CART))
     assert agrees(found, CART)
+
+
+@pytest.mark.parametrize("seed", [3, slow(0), slow(5), slow(13)])
+def test_gyroscopes_on_two_bars(seed):
+    truth = {"length": 0.6, "damping": 0.002}
+    start = np.random.default_rng(seed).uniform(-3.0, 3.0, 6)
+    start[:2] = 0.0
+    data = noisy(Chain(bars=2, mass=0.2, **truth).simulate(start, np.zeros(199), DT / 2), 0.01, seed)
+    data[:, [2, 4]] = np.nan
+    found = Chain(bars=2, mass=0.2).fit([(data, None, DT / 2)], list(truth))
+    assert agrees(found, truth) and found.warnings == ()
+
+
+def test_a_start_where_the_model_is_singular_is_not_chosen():
+    truth = Bob(drag=0.2)
+    data = truth.simulate([2.0, 0.0, 0.0, 2.0], 99, 0.02)
+    data[:, [0, 2]] = np.nan
+    found = Bob().fit([(data, None, 0.02)], ["drag"])
+    assert found.estimates["drag"] == pytest.approx(0.2, rel=1e-6)
 
 
 def test_several_recordings_angles_within_one_turn_and_controls_of_both_lengths():

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Starts that are tried for an angle whose rate alone was measured, spread over a turn.
-TRIED = 16
+#: At most, for angles whose rates alone were measured: starts that are tried for each, those tried for all of
+#: them together, and samples compared.
+TRIED, MOST_TRIED, COMPARED = 16, 4096, 64
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
 
@@ -133,7 +134,7 @@ def guess(scene: Scene, recording: Recording) -> Array:
         if len(seen):
             values = np.interp(np.arange(count), seen, recording.states[seen, i])
             known[entry.coordinate, entry.kind == "place"] = _parabolas(values, dt)
-    found, turns = np.zeros((count, len(entries))), []
+    found, turned = np.zeros((count, len(entries))), []
     for i, entry in enumerate(entries):
         place = entry.kind == "place"
         if (entry.coordinate, place) in known:
@@ -144,26 +145,32 @@ def guess(scene: Scene, recording: Recording) -> Array:
             rate = known[entry.coordinate, False][0]
             found[1:, i] = np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))
             if entry.unit == "rad" and entry.coordinate in layout_of(scene).free:
-                turns.append((i, entry.coordinate))
-    for i, coordinate in turns:
-        found[:, i] += _turn(scene, recording, found, i, coordinate, known[coordinate, False][1])
+                turned.append(i)
+    if turned:
+        slopes = {entries[i].coordinate: known[entries[i].coordinate, False][1] for i in turned}
+        found[:, turned] += _turns(scene, recording, found, turned, slopes)
     return found
 
 
-def _turn(scene: Scene, recording: Recording, states: Array, i: int, coordinate: str, slope: Array) -> float:
-    """Return the angle by which to turn entry i so that accelerations are most like the slopes of its rate.
+def _turns(
+    scene: Scene, recording: Recording, states: Array, turned: list[int], slopes: dict[str, Array]
+) -> Array:
+    """Return by how much to turn entries so that accelerations are most like the slopes of their rates.
 
     They are compared up to a factor, since the parameters are still wrong.
     """
-    controls = recording.controls if scene.control_names else 0.0
-
-    def likeness(angle: float) -> float:
-        turned = states[:-1].copy()
-        turned[:, i] += angle
-        found = scene.acceleration(turned, controls)[coordinate]
-        return float(slope[:-1] @ found) / max(float(np.linalg.norm(found)), np.finfo(float).tiny)
-
-    return max((2.0 * np.pi * k / TRIED for k in range(TRIED)), key=likeness)
+    count = min(TRIED, int(MOST_TRIED ** (1.0 / len(turned))))
+    angles = np.indices((count,) * len(turned)).reshape(len(turned), -1).T * (2.0 * np.pi / count)
+    steps = len(states) - 1
+    some = np.arange(0, steps, -(-steps // COMPARED))
+    tried = np.repeat(states[None, some], len(angles), axis=0)
+    tried[:, :, turned] += angles[:, None]
+    controls = np.broadcast_to(recording.controls[some], (*tried.shape[:2], recording.controls.shape[1]))
+    found = scene.acceleration(tried, controls if scene.control_names else 0.0)
+    accelerations = np.concatenate([found[name] for name in slopes], axis=1)
+    size = np.maximum(np.linalg.norm(accelerations, axis=1), np.finfo(float).tiny)
+    likeness = accelerations @ np.concatenate([slope[some] for slope in slopes.values()]) / size
+    return angles[np.argmax(np.where(np.isfinite(likeness), likeness, -np.inf))]
 
 
 def _parabolas(values: Array, dt: float) -> tuple[Array, Array]:
