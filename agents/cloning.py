@@ -144,3 +144,7 @@ def expert(task: Task, name: str) -> Any:
         return build(task, name or acting[0])
     except ValueError as error:
         raise UserError(str(error)) from error
+
+
+if __name__ == "__main__":
+    raise SystemExit("To train it: python -m agents.train ENV --algo cloning; --help says more")

@@ -401,10 +401,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("env", nargs="+", metavar="ENV", help="ids, module:ID, or FILE or FILE:Class of your own")
     p.add_argument("--seeds", type=int, default=1, metavar="N", help="how many, in turn (default 1)")
     p.add_argument("--first-seed", type=int, default=0, metavar="K", help="the first one (default 0)")
-    p.add_argument("--steps", type=int, metavar="N", help="environment steps per seed (default n_timesteps)")
+    p.add_argument(
+        "--steps", type=int, metavar="N", help="environment steps per seed (default: the task's own)"
+    )
     p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
     p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
-    group = p.add_argument_group("settings, of which each task has its own")
+    group = p.add_argument_group(
+        "settings (default: the task's own, which `lag-envs hyperparams fast_ppo` prints)"
+    )
     for name in OPTIONS:
         field = Settings.model_fields[name]
         kind: Any = {float: float, bool: yes_or_no}.get(field.annotation, int)

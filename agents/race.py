@@ -57,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     p.add_argument("--seeds", type=int, default=5, metavar="N", help="default %(default)s")
     p.add_argument("--first-seed", type=int, default=0, metavar="K", help="default %(default)s")
-    p.add_argument("--steps", type=int, metavar="N", help="steps of each training (default n_timesteps)")
+    p.add_argument("--steps", type=int, metavar="N", help="steps of each training (default: the task's own)")
     p.add_argument(
         "--output", type=new_file, metavar="FILE", help="keep each training as a line of JSON; resumes"
     )

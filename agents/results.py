@@ -59,7 +59,12 @@ def parser() -> argparse.ArgumentParser:
         "--output", type=Path, metavar="FOLDER", help="default: this checkout; with --quick, RUNS/quick"
     )
     p.add_argument("--episodes", type=int, metavar="N", help=f"under each condition (default {EPISODES})")
-    p.add_argument("--changed", type=int, metavar="N", help="at most N under changed conditions")
+    p.add_argument(
+        "--changed",
+        type=int,
+        metavar="N",
+        help="at most N under changed conditions (default: 200 for agents that plan, else as many)",
+    )
     p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether everything works")
     p.add_argument("--new", action="store_true", help="discard other agents' numbers in the summary")
     p.add_argument("--redraw", action="store_true", help="measure nothing: figures and page from the summary")

@@ -312,3 +312,7 @@ def slopes(network: nn.Module, seen: NDArray[np.float32]) -> NDArray[np.float32]
 def one_axis(rows: Array | None) -> Array | None:
     """Return single numbers without an axis of their own, as `Model` takes them."""
     return rows[:, 0] if rows is not None and rows.shape[1] == 1 else rows
+
+
+if __name__ == "__main__":
+    raise SystemExit("To train it: python -m agents.train ENV --algo shac; --help says more")

@@ -46,12 +46,13 @@ from lag_envs.workers import SpreadError, check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
-  model.zip            the policy: stable_baselines3's load reads it, agents.learners.load_policy plays it
-  tensorboard/         for `tensorboard --logdir FOLDER`
+  model.zip            the policy: agents.learners.load_policy plays any, stable_baselines3's load its own
+  tensorboard/         for `tensorboard --logdir FOLDER`, of Stable-Baselines3's learners
   {CHECKPOINT}       while the run is not finished: everything needed to resume ({TESTS} times a run)
 
 Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; finished seeds are left as they are.
-A run resumes from its last checkpoint, with different episodes than without the interruption.
+A run resumes from its last checkpoint: for fast_ppo, shac and cloning with the same result as without the
+interruption, for the others with different episodes.
 Policies of SAC, TD3, TQC and DQN get better and worse while they learn: the one that did best in a test, on
 separate episodes, is kept. For PPO it is the last one.
 
@@ -64,8 +65,8 @@ examples:
   python -m agents.train PivotedBar-v0 --seeds 10               ten seeds, as many at once as there are cores
   python -m agents.train PivotedBar-v0 --algo sac td3 --seeds 5
   python -m agents.train examples/ball_on_beam.py               a task of your own; this runs the file
-  python -m agents.train all --seeds 5                          the runs behind docs/agents.md
-  python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   the same, spread over a Ray cluster
+  python -m agents.train all --algo ppo fast_ppo sac td3 tqc dqn --seeds 5   the runs behind docs/agents.md
+  python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   a hundred seeds, spread over a Ray cluster
 """
 
 

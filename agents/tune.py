@@ -200,7 +200,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--episodes", type=int, help="episodes per trial (default 2000, with --settings 200)")
     p.add_argument("--generations", type=int, default=15, help="default %(default)s")
     p.add_argument("--settings", type=int, metavar="N", help=f"try this many settings of {LEARNER} instead")
-    p.add_argument("--steps", type=int, help="steps of each training (default n_timesteps)")
+    p.add_argument("--steps", type=int, help="steps of each training (default: the task's own)")
     p.add_argument("--seeds", type=int, default=2, help="trainings with each setting (default %(default)s)")
     p.add_argument("--jobs", type=int, default=1, help="trainings at once (default %(default)s)")
     p.add_argument("--output", type=new_file, metavar="FILE", help="default agents/results/tuning/ENV.json")

@@ -273,7 +273,7 @@ def test_the_page_states_the_protocols_numbers():
     text = " ".join(page().split())
     stated = [
         f"Each policy plays {protocol.EPISODES:,} episodes",
-        f"Score (IQM) in {protocol.DISTURBED_EPISODES} episodes with one",
+        f"The lowest score (IQM of {protocol.DISTURBED_EPISODES} episodes) over all changed conditions",
         f"Score (IQM) in {protocol.DISTURBED_EPISODES} episodes when acting",
         f"Percentile bootstrap, {100 * LEVEL:.0f} %, {RESAMPLES:,} samples",
         f"mean scores differ by at most {protocol.TOLERANCE:.0e}".replace("e-0", "e-"),

@@ -16,6 +16,7 @@ from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tables import aligned
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import KEYWORDS
 
 
 def facts(task: Task, name: str) -> list[str]:
@@ -41,9 +42,15 @@ def facts(task: Task, name: str) -> list[str]:
     ]
     text += ["", "Start (uniform, unless reset(options={'state': ...}))", *_indented(_starts(task))]
     text += ["", "Parameters, keywords of gym.make", *_indented(_parameters(task))]
+    own = type(task).imperfections
+    text += ["", "Imperfections, keywords too (None switches one off)"]
+    text += _indented([(f"{keyword}={value!r}",) for keyword, value in own.items()])
+    text += [f"  off: {', '.join(keyword for keyword in KEYWORDS if keyword not in own)}"]
     text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
     place = f"{type(task).__module__}.{type(task).__name__}"
-    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  python -m pydoc {place}"]
+    own_file = not place.startswith("lag_envs.")
+    more = f"see {inspect.getsourcefile(type(task))}" if own_file else f"python -m pydoc {place}"
+    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  {more}"]
     return text
 
 
@@ -105,7 +112,7 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
     rows += [("target", "None", "random if None")] * bool(task.formulas.target_boxes)
     return [
         *rows,
-        ("show_arrows", "False", "forces in pictures"),
+        ("show_arrows", "False", "arrows for controls and forces in pictures"),
         ("show_trail", "0 s", "length of the bodies' trails in pictures"),
         ("show_readout", "False", "time, return, score, controls and state below pictures"),
     ]

@@ -94,11 +94,12 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     """Declare the arguments of all commands that show an environment."""
     parser.add_argument("id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN}")
     parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
-    parser.add_argument("--steps", metavar="N", type=count, help="end after N steps")
-    parser.add_argument("--arrows", action="store_true", help="show forces too")
+    parser.add_argument("--steps", metavar="N", type=count, help="end after N steps (default: no end)")
+    parser.add_argument("--arrows", action="store_true", help="show arrows for controls and forces")
     parser.add_argument(
-        "--trail", metavar="S", type=seconds, default=0.0, help="show the path of the last S seconds"
-    )
+        "--trail", metavar="S", type=seconds, default=0.0,
+        help="show the path of the last S seconds (default: none)",
+    )  # fmt: skip
     parser.add_argument("--readout", action="store_true", help="show time, score, controls and state below")
 
 
@@ -125,8 +126,8 @@ PLAY = Command(
     "play",
     "drive an environment by keys or gamepad",
     """Drive an environment in a window, in real time: the arrow keys are for the first two controls,
-a, d, s and w for two more; the sticks of a gamepad do the same, in proportion. At an episode's end it
-shows the return, and the score on the leaderboard's scale.
+a, d, s and w for two more; the sticks of a gamepad do the same, in proportion. r starts over, q ends.
+At an episode's end it shows the return, and the score on the leaderboard's scale.
 
 examples:
   lag-envs play PivotedBar-v0
@@ -140,7 +141,8 @@ WATCH = Command(
     "watch",
     "watch an agent, in a window or as a video",
     """Watch an agent drive an environment, in a window, or write a video. By default it is the policy
-that comes with the package, the best on the leaderboard; controllers are chosen by name.
+that comes with the package, the best on the leaderboard; controllers are chosen by name. It needs the
+extras render and leaderboard; controllers also need controllers, and models of your own need agents.
 
 examples:
   lag-envs watch PivotedBar-v0

@@ -226,7 +226,10 @@ def verify_folder(
 def declare_verify(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``verify``."""
     parser.add_argument("folders", metavar="FOLDER", nargs="+", help="a submission")
-    parser.add_argument("--nonce", default="", help="decides the episodes (default: none)")
+    parser.add_argument(
+        "--nonce", default="", metavar="TEXT",
+        help="from it the episodes' seeds follow (default: empty, for the same practice episodes each time)",
+    )  # fmt: skip
     parser.add_argument(
         "--episodes", metavar="N", type=int, default=protocol.EPISODES,
         help="episodes of each policy (default: %(default)s, as on the board)",
