@@ -60,15 +60,17 @@ class Determined:
         left = np.linalg.norm(rest, axis=0)
         none = np.abs(moved[of >= 0]).max(axis=0) < NO_EFFECT
         none |= left <= DEPENDENT * np.linalg.norm(by_parameters, axis=0)
-        self._refuse([np.eye(p)[i] for i in np.flatnonzero(none)])
+        self._refuse([np.eye(p)[i] for i in np.flatnonzero(none)], values)
         basis, sizes, directions = np.linalg.svd(rest / left, full_matrices=False)
-        self._refuse([v / left for v, size in zip(directions, sizes, strict=True) if size < DEPENDENT])
+        self._refuse(
+            [v / left for v, size in zip(directions, sizes, strict=True) if size < DEPENDENT], values
+        )
         root = directions.T / sizes / left[:, None]
         self.covariance = root @ root.T
         self.leverage = np.sum(basis**2, axis=1) + np.sum(starts**2, axis=1)
         self.freedom = len(derivatives) - starts.shape[1] - p
 
-    def _refuse(self, directions: list[Array]) -> None:
+    def _refuse(self, directions: list[Array], values: Array) -> None:
         """Raise an error for directions in which the scaled parameters can change without any effect."""
         texts = []
         for direction in directions:
@@ -87,7 +89,10 @@ class Determined:
                     "nothing that was measured"
                 )
         if texts:
+            where = zip(self._parameters.names, values, strict=True)
             raise ValueError(
                 f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is "
-                "held, or add recordings in which it has an effect, such as some under known controls"
+                "held, or add recordings in which it has an effect, such as some under known controls. The "
+                f"search ended at {', '.join(f'{name}={value:.3g}' for name, value in where)}; if that is far "
+                "off, begin closer to the truth"
             )

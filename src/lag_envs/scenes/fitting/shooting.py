@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 #: The largest factor by which one search may change a parameter that is sought by its logarithm: parameters
 #: that short pieces do not determine must not run away.
 FARTHEST = np.log(1e3)
+#: The most evaluations of a search; one that has not gone astray takes a tenth of them.
+LONGEST = 500
 
 
 class Piece(NamedTuple):
@@ -192,4 +194,5 @@ class Shooting:
             x_scale="jac",
             ftol=tolerance,
             xtol=tolerance,
+            max_nfev=LONGEST,
         )
