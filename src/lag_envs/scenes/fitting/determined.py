@@ -89,10 +89,10 @@ class Determined:
                     "nothing that was measured"
                 )
         if texts:
-            where = zip(self._parameters.names, values, strict=True)
+            names = zip(self._parameters.names, values, strict=True)
+            ended = ", ".join(f"{name}={value:.3g}" for name, value in names)
             raise ValueError(
                 f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is "
                 "held, or add recordings in which it has an effect, such as some under known controls. The "
-                f"search ended at {', '.join(f'{name}={value:.3g}' for name, value in where)}; if that is far "
-                "off, begin closer to the truth"
+                f"search ended at {ended}; if that is far off, begin closer to the truth"
             )
