@@ -19,8 +19,11 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
 
 
-def facts(task: Task, name: str) -> list[str]:
-    """Return the lines: description, state, controls, observation, start, parameters, accuracy."""
+def facts(task: Task, name: str, formulas: str) -> list[str]:
+    """Return the lines: description, state, controls, observation, start, parameters, accuracy.
+
+    `formulas` says where the task's formulas are.
+    """
     scene = task.scene
     states = zip(scene.state_names, scene.state_units, strict=True)
     text = [name, "", _description(task), "", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
@@ -47,10 +50,7 @@ def facts(task: Task, name: str) -> list[str]:
     text += _indented([(f"{keyword}={value!r}",) for keyword, value in own.items()])
     text += [f"  off: {', '.join(keyword for keyword in KEYWORDS if keyword not in own)}"]
     text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
-    place = f"{type(task).__module__}.{type(task).__name__}"
-    own_file = not place.startswith("lag_envs.")
-    more = f"see {inspect.getsourcefile(type(task))}" if own_file else f"python -m pydoc {place}"
-    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  {more}"]
+    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  {formulas}"]
     return text
 
 

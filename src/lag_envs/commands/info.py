@@ -60,11 +60,12 @@ def run_info(args: argparse.Namespace) -> int:
         from lag_envs import own_files
 
         task = own_files.made_with_defaults(own_files.one(args.id), args.id)
-        name = task.id or type(task).__name__
+        name, formulas = task.id or type(task).__name__, f"see {args.id}"
     else:
         name = known_id(args.id)
         task = TASKS[name]()
-    print("\n".join(facts(task, name)))
+        formulas = f"python -m pydoc {type(task).__module__}.{type(task).__name__}"
+    print("\n".join(facts(task, name, formulas)))
     print("\n".join(_agents(task, name, args.id)))
     return 0
 
