@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
         "--changed",
         type=int,
         metavar="N",
-        help="at most N under changed conditions (default: 200 for agents that plan, else as many)",
+        help="at most N under changed conditions (default: 200 for agents that plan, else no limit)",
     )
     p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether everything works")
     p.add_argument("--new", action="store_true", help="discard other agents' numbers in the summary")

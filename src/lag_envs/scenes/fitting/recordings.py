@@ -124,7 +124,7 @@ def guess(scene: Scene, recording: Recording) -> Array:
 
     Measurements are smoothed lightly, and gaps are bridged. A rate that was not measured is the slope of the
     place; a place that was not measured is the integral of the rate from 0, or for an angle from where the
-    scene would accelerate most alike.
+    scene's accelerations are most like the data's.
     """
     dt, count = recording.dt, len(recording.states)
     entries = layout_of(scene).state
