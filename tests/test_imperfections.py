@@ -523,6 +523,8 @@ REFUSED = [
         {"observation_delay": (0.1, 0.01)},
         r"observation_delay must be \(shortest, longest\), got \(0.1, 0.01\)",
     ),
+    ({"observation_delay": np.array([0.1, 0.01])}, r"\(shortest, longest\), got \[0.1, 0.01\]"),
+    ({"observation_delay": [0.1, [0.2]]}, "observation_delay must be a real number"),
     ({"observation_delay": "late"}, "observation_delay must be a real number, got 'late'"),
     ({"action_delay": (0.1, 0.2, 0.3)}, "the shortest and the longest"),
     ({"action_delay": None, "slew": 0.0}, "slew must be above 0"),

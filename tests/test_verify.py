@@ -372,6 +372,12 @@ def test_command_refuses(tmp_path, arguments, reason):
         command(tmp_path, *arguments)
 
 
+def test_command_refuses_a_file_that_cannot_be_written(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        command(tmp_path, "--json", tmp_path)
+    assert f"argument --json: {tmp_path} is a folder" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_processes_give_the_same(tmp_path, result):
     for name in ("a", "b"):

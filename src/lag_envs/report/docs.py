@@ -253,7 +253,7 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
 INTRODUCTION = """\
 One control step, with its control held, is accurate to 1e-12: |error of θ| ≤ 1e-12 max(1, |θ|, |θ̇| dt) and
 |error of θ̇| ≤ 1e-12 max(1, |θ̇|, (α² + β²)^¼), where θ̈ = -α sinθ - β cosθ - γθ̇ + …. The same holds for lengths
-([numerics](numerics.md)), and for all environments with a flow of their own, over the ordinary ranges of
+([numerics](numerics.md)). This covers all environments with a flow of their own, over the ordinary ranges of
 their parameters, with damping γ dt up to 1e6. At extremes, the system itself amplifies a rounding of its
 state or parameters; there the error stays within ten times that amplification. A step that would need more
 than a million substeps, or has no finite result, raises `StepRefused` and leaves the state as it was.

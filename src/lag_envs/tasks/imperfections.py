@@ -235,7 +235,9 @@ def _seconds(keyword: str, value: Any, dt: float) -> float:
 
 def _delays(keyword: str, value: Any, dt: float) -> tuple[float, float]:
     """Return the shortest and the longest delay in control steps, from one for both or a sequence."""
-    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or np.ndim(value) == 0:
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, Sequence) or isinstance(value, str):
         delay = _seconds(keyword, value, dt)
         return delay, delay
     if len(value) != 2:

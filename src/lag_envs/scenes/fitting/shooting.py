@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 #: The largest factor by which one search may change a parameter that is sought by its logarithm: parameters
 #: that short pieces do not determine must not run away.
 FARTHEST = np.log(1e3)
-#: The most evaluations of a search; one that has not gone astray takes a tenth of them.
+#: The most evaluations of a search; nearly all that find the data take less than a tenth of them.
 LONGEST = 500
 
 
