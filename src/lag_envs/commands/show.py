@@ -142,7 +142,7 @@ WATCH = Command(
     "watch an agent, in a window or as a video",
     """Watch an agent drive an environment, in a window, or write a video. By default it is the policy
 that comes with the package, the best on the leaderboard; controllers are chosen by name. It needs the
-extras render and leaderboard; controllers also need controllers, and models of your own need agents.
+extras render and leaderboard; models of your own need agents too.
 
 examples:
   lag-envs watch PivotedBar-v0
