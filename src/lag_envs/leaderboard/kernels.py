@@ -17,17 +17,23 @@ from lag_envs.stepping.cache import jit
 @jit
 def affine(x: Any, weight: Any, bias: Any) -> Any:
     """Return x @ weight + bias for x (n, i), weight (i, o), bias (o,)."""
-    n, wide = len(x), weight.shape[1]
-    out = np.empty((n, wide))
+    n, (many, wide) = len(x), weight.shape
+    out, row = np.empty((n, wide)), np.empty(many)
     for r in range(n):
-        for j in range(wide):
-            out[r, j] = bias[j]
-        for i in range(weight.shape[0]):
-            value = x[r, i]
-            if -TINY < value < TINY:
-                value = 0.0
+        for i in range(many):
+            row[i] = 0.0 if -TINY < x[r, i] < TINY else x[r, i]
+        if wide < 5:  # too few to be summed side by side: each sum in a register, not in memory
             for j in range(wide):
-                out[r, j] += value * weight[i, j]
+                total = bias[j]
+                for i in range(many):
+                    total += row[i] * weight[i, j]
+                out[r, j] = total
+        else:
+            for j in range(wide):
+                out[r, j] = bias[j]
+            for i in range(many):
+                for j in range(wide):
+                    out[r, j] += row[i] * weight[i, j]
     return out
 
 
