@@ -295,6 +295,12 @@ class AcrobotReal(Task):
             "n_timesteps": 2e5, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_1e-3",
             "policy_kwargs": {"net_arch": [128, 128], "noise_steps": 4},
         },
+        # A step is short and pays at most 0.02: noise is held for 0.05 s, and eight steps count together.
+        "td3": {
+            "n_timesteps": 3e5, "n_steps": 8, "gamma": 0.995,
+            "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 10.0}}],
+            "policy_kwargs": {"net_arch": [64, 64], "noise_steps": 25, "noise": 0.5},
+        },
     }  # fmt: skip
     examples = Examples(
         start={"state": [2.8, -1.0, 0.3, 1.0]},
