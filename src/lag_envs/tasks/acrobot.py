@@ -318,8 +318,8 @@ class AcrobotReal(Task):
     note = (
         "The LQR is that of the project's leaderboard. It only holds links that are upright already; it "
         "does not swing up hanging ones. The plan was found on the exact model with friction; its feedback "
-        "comes from a model without dry friction. No learner comes close to the plan. On the acrobot TQC "
-        "gets further than the PPO in one file, from fewer steps."
+        "comes from a model without dry friction. All learners stay well below the plan. TD3, which holds its "
+        "noise for 0.05 s, gets furthest, from fewer steps than the PPO in one file."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
