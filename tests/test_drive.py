@@ -257,6 +257,40 @@ def test_a_link_is_recomputed_in_the_page(drive, link):
         assert verdict(page).startswith("The link is false")
 
 
+def test_after_a_false_link_one_drives_on_its_start(drive, link):
+    false = link._replace(claimed=np.nextafter(link.claimed, np.inf))
+    page = drive(link.id, replay.write_link(false))
+    until(page, "document.querySelector('.verdict').dataset.true === 'false'")
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    page.wait_for_timeout(300)
+    page.keyboard.press("Space")
+    mine = link_of(page)
+    assert replay.replay(mine).true and replay.read_link(mine).seed == link.seed
+
+
+def test_another_link_or_seed_may_follow_a_link(drive, link):
+    """The next address takes nothing from the link before; an error in the page fails the test."""
+    page = drive(link.id, replay.write_link(link))
+    ghost = "[...document.querySelectorAll('.drive-controls select')][1]"
+    until(page, f"{ghost}.value === 'link:0'")
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    page.evaluate("location.hash = '#drive=1~bad'")
+    until(page, "document.querySelector('.verdict').textContent.includes('damaged')")
+    assert page.evaluate(f"{ghost}.value") == ""
+    page.evaluate(f"location.hash = {replay.write_link(link)!r}")
+    until(page, f"{ghost}.value === 'link:0'")
+    page.click(".rerun")
+    page.evaluate("location.hash = '#seed=9'")
+    until(page, "location.hash === '#seed=9'")
+    page.focus(".stage")
+    page.keyboard.press("r")
+    page.wait_for_timeout(300)
+    page.keyboard.press("Space")
+    assert replay.read_link(link_of(page)).seed == 9
+
+
 #: Invalid links, whole or as changes of a valid one; and the page's messages.
 IMPOSSIBLE = [
     ({"step": "00000000"}, "another version"),
@@ -267,6 +301,8 @@ IMPOSSIBLE = [
     slow({"seed": 2**64}, "forged"),
     slow({"keys": replay.pack([(65,)])}, "between -64 and 64"),
     slow({"keys": "gA"}, "damaged"),
+    slow({"keys": ""}, "no step"),
+    slow({"keys": "gAECB"}, "forged"),
     slow("#seed=99999999999999999999", "below 2"),
 ]
 

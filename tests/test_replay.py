@@ -49,6 +49,11 @@ def test_several_controls_choices_targets_and_kicks(task):
     assert found.true and found.finished and found.score is None
 
 
+def test_a_link_may_be_percent_encoded():
+    link = replay.write_link(short())
+    assert replay.read_link(link.replace("~", "%7E") + "%0A") == short()
+
+
 def test_a_claim_in_its_last_bit_is_false():
     drive = driven(TASKS[ID]())
     (bits,) = struct.unpack(">q", struct.pack(">d", drive.claimed))
@@ -90,6 +95,7 @@ def altered(field, value):
         (altered(2, "\u0667"), "a whole number"),
         ("#drive=1~a\udcff~1~gA~3fe0000000000000~01234567~00000000", "checksum"),
         (altered(3, "é"), "base64url"),
+        (altered(3, ""), "no step"),
         (altered(3, "gA"), "middle of a key"),
         (altered(3, "gICAgICAgAE"), "too long"),
         (altered(3, replay.pack([(65,)])), "between -64 and 64"),

@@ -25,6 +25,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 from lag_envs.errors import UserError, hint
 
@@ -114,6 +115,7 @@ def read_link(link: str) -> Drive:
     """
     if len(link) > LONGEST:
         raise LinkError(f"the link has {len(link):,} characters, at most {LONGEST:,} are read")
+    link = unquote(link)  # some programs write ~ as %7E
     text = link.strip().rpartition(MARK)[2]
     fields = text.split("~")
     if MARK not in link or len(fields) < 2:
@@ -138,6 +140,8 @@ def read_link(link: str) -> Drive:
         raise LinkError(f"the link's digest must be 8 hexadecimal digits, got {_short(step)}")
     if not re.fullmatch(r"[A-Za-z0-9_-]*", keys):
         raise LinkError("the link's keys hold characters that base64url does not have")
+    if not keys:
+        raise LinkError("the link's drive has no step")
     return Drive(id, int(seed), keys, struct.unpack(">d", bytes.fromhex(claimed))[0], step)
 
 

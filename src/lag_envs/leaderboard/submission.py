@@ -1,4 +1,4 @@
-"""Read and write a submission: a folder with ``submission.toml`` and arrays. Nothing in it is ever run.
+"""Read and write a submission: a folder with ``submission.toml`` and arrays. No code in it is ever run.
 
 Reading goes from the outside in: first the names and sizes of the files, then the text, then the header of
 each file of arrays, and only then the arrays. Bad input is refused before more is read.

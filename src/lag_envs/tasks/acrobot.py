@@ -34,7 +34,7 @@ class AcrobotExact(Task):
     Two things differ. Gymnasium takes one Runge-Kutta step of 0.2 s at a time, so the energy of the undriven
     links drifts by joules within an episode. Here the motion under the held torque is exact. And Gymnasium
     clips the speeds at 4π and 9π rad/s, which removes energy without a physical cause. Here the speeds are
-    free, and only their *observations* are clipped.
+    free, and only their observations are clipped.
 
     The inertia of 1 kg m² about each centre of mass is kept, although no link of 1 kg and 1 m can have it: no
     mass distribution within a link gives more than a quarter of that.

@@ -202,11 +202,12 @@
     if (fields.length !== 7 || check !== crc32(fields.slice(0, 6).join("~"))) {
       throw new Error("The link is damaged; copy it once more, whole.");
     }
-    if (id !== about.id) throw new Error(`The link is of another environment, ${id}.`);
-    if (!/^(0|[1-9]\d{0,19})$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed)) {
+    if (id !== about.id) throw new Error(`The link is of another environment, ${id.slice(0, 60)}.`);
+    if (!/^(0|[1-9]\d{0,19})$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed) || packed.length % 4 === 1) {
       throw new Error("The link is forged: a field is not what it must be.");
     }
     if (digest !== about.digest) throw new Error("The drive was made with another version of this environment.");
+    if (!packed) throw new Error("The link's drive has no step.");
     return { seed: big(seed), keys: unpack(packed, about), claimed };
   }
 
@@ -570,7 +571,11 @@
         return { name: board.rows[row].name, act: (episode) => act(episode) };
       }),
       stored: (row) => tools.episodes(board.rows[row].file).then((replays) => ({ name: board.rows[row].name, replays })),
-      link: () => Promise.resolve({ name: "the link's driver", seed: linked.seed, act: (episode) => actionOf(linked.keys[episode.steps] ?? linked.keys[linked.keys.length - 1], about) }),
+      link: () => {
+        const { seed: start, keys } = linked; // another link may come while this one's ghost runs
+        const act = (episode) => actionOf(keys[episode.steps] ?? keys[keys.length - 1], about);
+        return Promise.resolve({ name: "the link's driver", seed: start, steps: keys.length, act });
+      },
     };
 
     function listGhosts() {
@@ -629,7 +634,7 @@
     }
 
     function stepGhost() {
-      if (!ghost?.act || ghost.episode.over) return;
+      if (!ghost?.act || ghost.episode.over || ghost.episode.steps >= ghost.steps) return;
       ghost.past = ghost.now;
       ghost.episode.step(ghost.act(ghost.episode));
       ghost.now = ghost.episode.poses();
@@ -873,6 +878,11 @@
     function checkLink(hash) {
       linked = rerunning = null;
       watch.hidden = true;
+      if (ghostSelect.value.startsWith("link:")) {
+        ghostSelect.value = "";
+        ghost = null;
+      }
+      listGhosts();
       let told;
       try {
         told = readLink(hash, about);
@@ -913,6 +923,8 @@
         if (fair) {
           ghostSelect.value = "link:0";
           chooseGhost();
+        } else {
+          restart();
         }
       };
       go();
@@ -938,6 +950,7 @@
         return;
       }
       seed = big(match[1]);
+      rerunning = null;
       restart();
     }
 

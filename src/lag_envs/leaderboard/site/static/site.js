@@ -961,7 +961,7 @@
     const body = find("tbody", table);
     const form = find(".filter");
     const order = find("[name=order]", form);
-    const status = find(".status");
+    const status = find("#ranking .status");
     const head = find("th.score", table);
     const axis = make("span", { class: "axis", "aria-hidden": "true" });
     head.append(axis);
