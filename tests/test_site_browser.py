@@ -252,7 +252,7 @@ def test_sorting_by_mouse_and_keyboard(open_page, data):
     assert sorted_by() == ["Settle ascending"]
     page.click("[data-key=settle]")
     assert column(page, ".name bdi") == names("settle", False)
-    assert "descending" in page.evaluate("document.querySelector('.status').textContent")
+    assert "descending" in page.evaluate("document.querySelector('#ranking .status').textContent")
     page.evaluate("document.querySelector('[data-key=return]').focus()")
     page.keyboard.press("Enter")
     assert column(page, ".name bdi") == names("return", False)
@@ -268,7 +268,7 @@ def test_filtering(open_page, data):
     page, rows = open_page(), data["environments"][0]["rows"]
     page.click(".filter [value=controller]")
     assert column(page, ".name bdi") == [r["name"] for r in rows if r["kind"] == "controller"]
-    assert page.evaluate("document.querySelector('.status').textContent") == "3 of 10 agents"
+    assert page.evaluate("document.querySelector('#ranking .status').textContent") == "3 of 10 agents"
     page.keyboard.press("ArrowRight")
     assert column(page, ".name bdi") == ["Value iteration, 81 nodes"]
     page.click(".filter [value='']")
