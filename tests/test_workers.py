@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pebble.pool.process import WorkerManager
 
 from lag_envs import workers
 from lag_envs.workers import SpreadError, as_they_finish, check_address, died, processes
@@ -49,6 +50,23 @@ def test_whatever_becomes_of_one_the_others_go_on():
     assert died(found["raises"]) == "ValueError: no"
     assert isinstance(found["returns what cannot be sent"], Exception)
     assert os.environ.get("OMP_NUM_THREADS") == threads
+
+
+@pytest.mark.parametrize("given", [["dies", "works"], ["hangs", "dies", "works"]])
+def test_a_death_belongs_to_its_work_though_its_message_is_late(given, monkeypatch):
+    """On a busy machine, a process may be found dead before it was read that it had taken the work."""
+    receive = WorkerManager.receive
+
+    def late(self, timeout):
+        time.sleep(0.3)
+        return receive(self, timeout)
+
+    monkeypatch.setattr(WorkerManager, "receive", late)
+    with processes(2, begin, "hello") as submit:
+        limits = {"hangs": 3.0}
+        futures = {what: submit(work, what, timeout=limits.get(what)) for what in given}
+        assert died(futures["dies"].exception(timeout=60.0)) == "the process died, exit status 3"
+        assert futures["works"].result(timeout=60.0) == ("hello", "1")
 
 
 def test_who_leaves_early_does_not_wait():

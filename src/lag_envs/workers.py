@@ -12,6 +12,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
@@ -51,15 +52,11 @@ def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator
         Called with `args` in each process before its first work. Work still running when the block is left
         is killed.
     """
-    from pebble import ProcessPool
-
     from lag_envs.host import ONE_THREAD
 
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)  # processes inherit it when they start
-    pool = ProcessPool(
-        count, context=multiprocessing.get_context("spawn"), initializer=_begin, initargs=(begin, args)
-    )
+    pool = _pool(count, begin, args)
 
     def submit(function: Callable, *args: Any, timeout: float | None = None) -> Future:
         return pool.schedule(function, args=args, timeout=timeout)
@@ -71,6 +68,36 @@ def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator
         pool.join()
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
+    """Return Pebble's pool, made to read a dead process's last message before it looks for its work.
+
+    That message may say which work the process had taken. Pebble 5.2 does not wait for it: on a busy machine,
+    work that dies at once then never finishes, or all work is given up.
+    """
+    from pebble.pool.process import PoolManager, ProcessPool
+
+    class Manager(PoolManager):
+        rounds = 0
+
+        def process_next_message(self, timeout: float) -> None:  # in a thread of its own, again and again
+            super().process_next_message(timeout)
+            self.rounds += 1
+
+        def handle_worker_expiration(self, expiration: tuple) -> None:
+            while self.context.alive and self.worker_manager.pool_channel.poll(0.0):  # type: ignore[union-attr]
+                time.sleep(0.01)
+            # One message may have been taken from the channel already; the next round comes after it.
+            begun = self.rounds
+            while self.context.alive and self.rounds < begun + 2:
+                time.sleep(0.01)
+            super().handle_worker_expiration(expiration)
+
+    context: Any = multiprocessing.get_context("spawn")
+    pool = ProcessPool(count, context=context, initializer=_begin, initargs=(begin, args))
+    pool._pool_manager = Manager(pool._context, context)
+    return pool
 
 
 def _begin(begin: Callable | None, args: Sequence[Any]) -> None:
