@@ -95,6 +95,7 @@ OTHERS_PRIVATE = {
     "_get_indices", "_options", "_reset_options", "_reset_seeds", "_seeds",  # Stable-Baselines3's VecEnv
     "_getvalue",  # Numba's arrays
     "_mpf_",  # mpmath's numbers
+    "_pool_manager",  # Pebble's pool
     "_asdict", "_fields", "_replace",  # named tuples: public, the underscore avoids names of fields
 }  # fmt: skip
 

@@ -96,7 +96,7 @@ def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
 
     context: Any = multiprocessing.get_context("spawn")
     pool = ProcessPool(count, context=context, initializer=_begin, initargs=(begin, args))
-    pool._pool_manager = Manager(pool._context, context)
+    pool._pool_manager = Manager(pool._pool_manager.context, context)
     return pool
 
 
