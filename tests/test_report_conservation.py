@@ -8,6 +8,7 @@ import pytest
 from covering import PERFECT, covering
 
 from lag_envs.report import conservation, leave_out
+from lag_envs.report.points import ROUNDING
 from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks import TASKS
 
@@ -112,7 +113,7 @@ def test_cosine_and_sine_stay_a_pair(name):
     assert np.abs(c * c + s * s - 1.0).max() < 1e-15
     turns = (theta - np.arctan2(s, c)) / (2.0 * math.pi)
     apart = 2.0 * math.pi * np.abs(turns - np.round(turns))
-    assert (apart <= 4.0 * conservation.EPS * at * np.maximum(1.0, np.abs(theta))).all()
+    assert (apart <= 4.0 * ROUNDING * at * np.maximum(1.0, np.abs(theta))).all()
 
 
 #: Constants that act only at random or at a limit are changed by more, so that few steps show it.

@@ -16,11 +16,10 @@ from lag_envs.report import diagrams, peers, verdicts, work_precision
 from lag_envs.report.cases import VARIANTS, ensemble
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
-from lag_envs.report.points import MODES, WorkPrecisionPoint
+from lag_envs.report.points import LAG_ENVS, MODES, TARGETS, WorkPrecisionPoint
 from lag_envs.report.rivals import CompiledMethod, ShippedStepping
 from lag_envs.report.runner import JobResult
 from lag_envs.report.timing import FlowSteps
-from lag_envs.report.verdicts import LAG_ENVS, TARGETS
 from lag_envs.report.work_precision import OrderedMethod
 from lag_envs.scenes.derivation import form_of
 

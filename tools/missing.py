@@ -14,11 +14,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from lag_envs.options import module_parser
 from lag_envs.tables import aligned
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured_ids
-from tools.options import take_none
 
 ROOT = Path(__file__).parents[1]
 #: Everything that can be generated, with its command; ID stands for the environment.
@@ -117,7 +117,7 @@ def _measured_errors() -> Iterable[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the missing items; return 1 if there are any."""
-    take_none("python -m tools.missing", __doc__, arguments)
+    module_parser("tools.missing", __doc__, "examples:\n  python -m tools.missing").parse_args(arguments)
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
     print(
         "\n".join(aligned([["environment", "missing", "command"], *rows])) if rows else "Nothing is missing."

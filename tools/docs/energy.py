@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers import make_controller
+from lag_envs.options import module_parser
 from lag_envs.report.episodes import endless_actions
 from lag_envs.report.gymnasium_peers import PEERS, record_peer
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
-from tools.options import take_none
 
 ROOT = Path(__file__).parents[2]
 Array = NDArray[np.float64]
@@ -116,7 +116,9 @@ def energy_figure(env_id: str) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print returns, draw pictures."""
-    take_none("python -m tools.docs.energy", __doc__, arguments)
+    module_parser("tools.docs.energy", __doc__, "examples:\n  python -m tools.docs.energy").parse_args(
+        arguments
+    )
     from agents.figures import save
 
     for env_id, peer_id in with_peer().items():

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from lag_envs.options import module_parser
 from lag_envs.scenes import Pendulum
 from lag_envs.scenes.fitting.result import Fit
 from lag_envs.store import write_file
-from tools.options import take_none
 
 ROOT = Path(__file__).parents[2]
 RECORDING = ROOT / "examples" / "pendulum.csv"
@@ -64,7 +64,7 @@ def fitted() -> Fit:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the recording, fit it, draw the residuals."""
-    take_none("python -m tools.docs.fit", __doc__, arguments)
+    module_parser("tools.docs.fit", __doc__, "examples:\n  python -m tools.docs.fit").parse_args(arguments)
     from agents.figures import save
 
     write_file(RECORDING, recording())

@@ -7,13 +7,10 @@ import math
 from collections.abc import Callable
 from datetime import date
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
-
-if TYPE_CHECKING:
-    pass
 
 #: Alternative to ids in `report`, `info`, `bench` and `play`.
 OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.envs.program import program_for
+from lag_envs.envs.program import absent_from, program_for
 from lag_envs.envs.reverse import Reverse
-from lag_envs.envs.single import absent
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
@@ -86,7 +85,7 @@ class Model:
     def __init__(self, task: Task) -> None:
         self.task = task
         constants = task.formulas.constants()
-        program = program_for(task, absent([constants]))
+        program = program_for(task, absent_from(constants))
         self._constants = SimpleNamespace(**constants)
         self._numbers = np.array([constants[name] for name in program.uniform])
         self._step = program.model

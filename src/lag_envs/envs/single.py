@@ -419,11 +419,6 @@ def plain_data(value: Any) -> Any:
     return value.value if isinstance(value, enum.Enum) else value
 
 
-def absent(constants: list[dict[str, float]]) -> frozenset[str]:
-    """Return the names of the constants that are zero in all environments: they cost nothing."""
-    return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
-
-
 def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
     """Return a space that contains the observations of all the tasks."""
     boxes = [seen_box(task) for task in {id(task): task for task in tasks}.values()]

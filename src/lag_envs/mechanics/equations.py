@@ -27,11 +27,6 @@ def velocity(name: str) -> Atom:
     return Atom("velocity", name)
 
 
-def acceleration(name: str) -> Atom:
-    """Return the symbol of a coordinate's second derivative."""
-    return Atom("acceleration", name)
-
-
 @dataclasses.dataclass(frozen=True)
 class Energies:
     """The results of a scene's formulas on recorded numbers.

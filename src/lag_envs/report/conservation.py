@@ -13,6 +13,7 @@ from lag_envs.report import reference
 from lag_envs.report.cases import VARIANTS
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import METHODS, comparison
+from lag_envs.report.points import LAG_ENVS, ROUNDING
 from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SECTION = "conservation"
-LAG_ENVS = "lag_envs"
-EPS = 2.0**-53
 COLOURS = {
     LAG_ENVS: "#000000",
     "RK4": "#0072b2",
@@ -179,7 +178,7 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
             total = mpf(0)
             for j, value in enumerate(start):
                 moved = [mpf(x) for x in start]
-                moved[j] += EPS * mpf(max(abs(value), 1.0))
+                moved[j] += ROUNDING * mpf(max(abs(value), 1.0))
                 total += abs(reference.exact_flow(scene, moved, 0.0, float(n) * dt)[0] - exact[0])
         amplified.append(float(total))
     return {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -49,4 +49,4 @@ class Content:
     pictures: Sequence[ReportFigure] = ()
     claims: Sequence[Claim] = ()
     summary: Table | None = None  #: a small table for the README
-    details: Sequence[Table] = field(default=())  #: long tables: CSV only
+    details: Sequence[Table] = ()  #: long tables: CSV only

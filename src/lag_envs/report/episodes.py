@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from lag_envs.report import reference
 from lag_envs.report.oracle import oracle_of
+from lag_envs.report.points import ROUNDING
 from lag_envs.report.runner import Row
 from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
-EPS = 2.0**-53
 DIGITS = 34
 #: Errors are given up to these times [s], and up to the end.
 TIMES = (1.0, 5.0, 10.0)
@@ -102,7 +102,7 @@ def sizes(states: Array) -> Array:
 def moved_start(states: Array) -> list[mpf]:
     """Return the start with every entry moved by one rounding of its size."""
     with mp.workdps(60):
-        return [mpf(x) + EPS * mpf(size) for x, size in zip(states[0], sizes(states), strict=True)]
+        return [mpf(x) + ROUNDING * mpf(size) for x, size in zip(states[0], sizes(states), strict=True)]
 
 
 def episode_errors(

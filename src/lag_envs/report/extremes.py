@@ -12,12 +12,12 @@ from mpmath import mp, mpf
 from lag_envs import scenes
 from lag_envs.report import reference
 from lag_envs.report.cases import Case, scales
+from lag_envs.report.points import ROUNDING
 from lag_envs.report.runner import Row
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 
-EPS = 2.0**-53
 #: README's accuracy, relative to the scales; and how many roundings of the state are allowed in addition.
 EXACT, ROUNDINGS = 1e-12, 10.0
 
@@ -158,11 +158,11 @@ def amplification(case: Case, dt: float) -> list[float]:
             moved = []
             for sign in (1, -1):
                 start = [mpf(x) for x in state]
-                start[j] += sign * EPS * mpf(size)
+                start[j] += sign * ROUNDING * mpf(size)
                 end = reference.exact_flow(scene, start, control, dt)
                 moved.append([abs(a - b) for a, b in zip(end, base, strict=True)])
             for i, changes in enumerate(zip(*moved, strict=True)):
-                total[i] += float(max(changes)) / EPS
+                total[i] += float(max(changes)) / ROUNDING
     return total
 
 
@@ -215,11 +215,11 @@ def measure_extreme(name: str) -> Row:
     exact = reference.remembered(case.scene, case.state, case.control, extreme.dt)
     errors = [abs(e) for e in reference.state_differences(end, exact)]
     sizes, gains = scales(case, extreme.dt), amplification(case, extreme.dt)
-    limits = [(EXACT * s, ROUNDINGS * EPS * g) for s, g in zip(sizes, gains, strict=True)]
+    limits = [(EXACT * s, ROUNDINGS * ROUNDING * g) for s, g in zip(sizes, gains, strict=True)]
     row["error"] = max(e / s for e, s in zip(errors, sizes, strict=True))
     row["amplification"] = max(g / s for g, s in zip(gains, sizes, strict=True))
     ends = [max(g, float(abs(x))) for g, x in zip(gains, exact, strict=True)]
-    row["roundings"] = max(e / (EPS * size) if e else 0.0 for e, size in zip(errors, ends, strict=True))
+    row["roundings"] = max(e / (ROUNDING * size) if e else 0.0 for e, size in zip(errors, ends, strict=True))
     full = all(e <= plain for e, (plain, _) in zip(errors, limits, strict=True))
     allowed = all(e <= plain + more for e, (plain, more) in zip(errors, limits, strict=True))
     outcome = FULL if full else AMPLIFIED if allowed else "less accurate"

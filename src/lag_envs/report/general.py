@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.report.general_results import CERTIFIED_ORDERS, DT, MEMBERS, MODES, content
+from lag_envs.report.general_results import CERTIFIED_ORDERS, DT, MEMBERS, content
 from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
 from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.peers import Heyoka
+from lag_envs.report.points import MODES
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import exact_ends
 from lag_envs.report.rivals import CompiledMethod, Rival

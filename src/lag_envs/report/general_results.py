@@ -13,6 +13,7 @@ import numpy as np
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.linkages import SYSTEMS
 from lag_envs.report.motions import CertifiedSeries
+from lag_envs.report.points import MODES, TARGETS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.series import TOLERANCE
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
 DT, MEMBERS = 0.02, 200
 #: Orders at which the certificate is tried.
 CERTIFIED_ORDERS = (12, 14, 16, 18, 20, 22)
-#: Errors at which times are compared.
-TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
-MODES = {"single": "alone", "batch": "in a batch"}
 LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "compiled": "compiled"}
 #: Largest difference of equal models, and largest loss of energy, relative.
 EQUAL, DRIFT = 1e-12, 1e-9

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lag_envs import TASKS
-from lag_envs.envs.program import Program
+from lag_envs.envs.program import Program, absent_from
 from lag_envs.report.cases import Case
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import plain_series
@@ -103,7 +103,7 @@ def carried_numbers(task: Task) -> Row:
     """Return state, terms, stages and constants of a task's compiled step, and those that nothing uses."""
     scene = task.scene
     numbers = task.formulas.constants()
-    absent = frozenset(name for name, value in numbers.items() if value == 0.0)
+    absent = absent_from(numbers)
     program = Program(task, absent)
     stepped = Stepped(scene, dt=task.dt)
     code = stepped.stepper()

@@ -21,7 +21,7 @@ from lag_envs.report.timing import BLOCK, Sample
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.stepping.compiling import compile_function
-from lag_envs.stepping.general import series_code_of, stepper_of
+from lag_envs.stepping.general import series_code_of
 
 if TYPE_CHECKING:
     from lag_envs.report.linkages import System
@@ -189,7 +189,7 @@ class CertifiedSeries(Rival):
         starts, controls, count = problems.starts, problems.controls, len(problems)
         width, order = starts.shape[1], float(self.order)
         if not together:
-            alone = _alone(stepper_of(scene.mechanics), code, self.setting)
+            alone = _alone(code, self.setting)
             ends = np.empty_like(starts)
 
             def run() -> None:
@@ -197,7 +197,7 @@ class CertifiedSeries(Rival):
                     raise ArithmeticError("a step was refused")
 
             return Sample(run, count, ends=ends.copy)
-        batch = _batch(stepper_of(scene.mechanics), code, self.setting)
+        batch = _batch(code, self.setting)
         blocks = -(-count // BLOCK)
         rows = width + controls.shape[1] + len(code.rows) + 1
         memory = np.zeros((blocks, rows, BLOCK))
@@ -224,7 +224,7 @@ class CertifiedSeries(Rival):
 
 
 @cache
-def _alone(stepper: Any, code: Any, tolerance: float) -> Callable:
+def _alone(code: Any, tolerance: float) -> Callable:
     """Compile ``alone(starts, controls, ends, dt, order, constants...)``: a control step from each state."""
     lines = [
         f"def alone(starts, controls, ends, dt, order{''.join(f', {name}' for name in code.constants)}):",
@@ -242,7 +242,7 @@ def _alone(stepper: Any, code: Any, tolerance: float) -> Callable:
 
 
 @cache
-def _batch(stepper: Any, code: Any, tolerance: float) -> Callable:
+def _batch(code: Any, tolerance: float) -> Callable:
     """Compile ``batch(memory, count, dt, order, constants...)``: a control step of all lanes, block by block.
 
     A block has rows for state and controls, then those of `StepCode.rows`, and one more.

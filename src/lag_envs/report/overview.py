@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from lag_envs.report.diagrams import DARK, STYLES
+from lag_envs.report.points import LAG_ENVS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
 #: Columns of the general table that are not rivals, and the names of rivals in the picture.
 RIVALS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
-LAG_ENVS = "lag_envs"
 Points = list[tuple[float, float]]
 
 

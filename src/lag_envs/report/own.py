@@ -26,6 +26,7 @@ from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.oracle import Unresolved
 from lag_envs.report.peers import Heyoka
+from lag_envs.report.points import MODES
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import exact_ends
 from lag_envs.report.rivals import CompiledMethod, Rival
@@ -245,7 +246,7 @@ def step_points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]
     ]
     others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
     clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
-    for mode in general_results.MODES:
+    for mode in MODES:
         for rivals in (compiled_here, others):
             yield from general.timed_rivals(
                 problems, truth, rivals, clock, mode, 3 if quick else 7, {"system": name}, s.dt
@@ -342,7 +343,7 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             t
             for t in (
                 _steps(rows),
-                *(_times(found, mode) for mode in general_results.MODES),
+                *(_times(found, mode) for mode in MODES),
                 _stability(rows),
             )
             if t.rows

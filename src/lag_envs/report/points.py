@@ -8,6 +8,12 @@ from typing import NamedTuple
 
 from lag_envs.report.runner import Row
 
+#: The name of the shipped stepping among the methods.
+LAG_ENVS = "lag_envs"
+#: Half a unit in the last place of 1.
+ROUNDING = 2.0**-53
+#: Errors at which times are compared.
+TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 MODES = {"single": "alone", "batch": "in a batch"}
 HORIZONS = ("one step", "10 s", "1,000 s")
 LIBRARIES = {
@@ -36,7 +42,7 @@ class WorkPrecisionPoint(NamedTuple):
     @property
     def own(self) -> bool:
         """Whether it is the shipped method."""
-        return self.family == "lag_envs"
+        return self.family == LAG_ENVS
 
     @property
     def diverged(self) -> int:

@@ -12,12 +12,12 @@ from lag_envs.report import extremes, reference
 from lag_envs.report.cases import Case, scales
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.integrators import comparison
+from lag_envs.report.points import LAG_ENVS, ROUNDING
 from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.stability_maps import MAPS
 from lag_envs.report.stability_results import (
     DIVERGED,
     FAR_OFF,
-    LAG_ENVS,
     MOST_SUBSTEPS,
     NO_REFERENCE,
     PEERS,
@@ -89,7 +89,7 @@ def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
     """Return the largest error of an entry over the effect of one rounding of the start."""
     exact = reference.remembered(case.scene, case.state, case.control, dt)
     errors, gains = reference.state_differences(end, exact), extremes.amplification(case, dt)
-    shares = [abs(e) / (extremes.EPS * g) for e, g in zip(errors, gains, strict=True) if g]
+    shares = [abs(e) / (ROUNDING * g) for e, g in zip(errors, gains, strict=True) if g]
     return max(shares, default=None)
 
 

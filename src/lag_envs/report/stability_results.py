@@ -12,6 +12,7 @@ import numpy as np
 from lag_envs.report import extremes
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.extremes import EXACT
+from lag_envs.report.points import LAG_ENVS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.report.stability_maps import MAPS, STARTS
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PEERS = ("ETD4RK", "implicit midpoint", "RK4", "Verlet", "explicit Euler")
-LAG_ENVS = "lag_envs"
 #: Contents of a cell other than an error.
 REFUSED, DIVERGED, NO_REFERENCE, TOO_LONG = "refused", "diverged", "no reference", "not run"
 #: An error of this many times the state's size counts as divergence, like a result that is not finite.

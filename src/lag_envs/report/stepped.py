@@ -70,7 +70,7 @@ class Stepped:
 
     def largest_majorant(self, dt: float) -> float:
         """Return the x of the bound up to which one series is certified."""
-        return pendulum.largest_majorant(dt, self.flow.order or pendulum.ORDER, self.flow.tolerance)
+        return pendulum.largest_majorant(dt, self.flow.order or pendulum.ORDER)
 
     def stepper(self) -> Stepper:
         """Return the code of a step, without the constants that are zero."""

@@ -14,15 +14,20 @@ from typing import Any, NamedTuple
 from lag_envs.report.cases import VARIANTS
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.diagrams import draw_variant
-from lag_envs.report.points import HORIZONS, LIBRARIES, MODES, WorkPrecisionPoint, gathered
+from lag_envs.report.points import (
+    HORIZONS,
+    LAG_ENVS,
+    LIBRARIES,
+    MODES,
+    ROUNDING,
+    TARGETS,
+    WorkPrecisionPoint,
+    gathered,
+)
 from lag_envs.report.runner import JobResult, Row
 
-LAG_ENVS = "lag_envs"
-ROUNDING = 2.0**-53
 #: An error below this many roundings, or amplified roundings, counts as no error at all.
 ROUNDINGS = 4
-#: Errors at which times are compared.
-TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 #: The ones shown in README.
 SHOWN = TARGETS[1:]
 #: Error at which lag_envs is claimed to be the fastest: the promised accuracy of a step, and what the

@@ -20,12 +20,12 @@ from lag_envs.report import peers, reference
 from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
 from lag_envs.report.integrators import METHODS, comparison, plain_series
-from lag_envs.report.points import MODES
+from lag_envs.report.points import MODES, ROUNDING
 from lag_envs.report.rivals import CompiledMethod, Rival, ShippedStepping
 from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import FlowSteps, Sample, interleaved
-from lag_envs.report.verdicts import ROUNDING, content
+from lag_envs.report.verdicts import content
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.flows import Flow
 
@@ -115,7 +115,7 @@ def jobs(quick: bool) -> list[ReportJob]:
 # --- exact ends ---
 
 
-def problems(variant: str, horizon: str, cases: Sequence[Case]) -> list[Case]:
+def problems(horizon: str, cases: Sequence[Case]) -> list[Case]:
     """Return the cases of a horizon; those over 1,000 s have no control, and pendulums no damping."""
     if horizon != "1,000 s":
         return list(cases)
@@ -157,8 +157,7 @@ def truths(variant: str, horizon: str, plan: Horizon) -> list[ExactEnd]:
     """Return the exact ends of a horizon's members."""
     dt = control_step(variant)
     return [
-        exact_end(case, dt, plan.steps(dt))
-        for case in problems(variant, horizon, ensemble(variant, plan.members))
+        exact_end(case, dt, plan.steps(dt)) for case in problems(horizon, ensemble(variant, plan.members))
     ]
 
 
@@ -206,7 +205,7 @@ def variant_rivals(variant: str, horizon: str, family: str, quick: bool) -> list
     """Return a family's methods at all settings; lag_envs is among the compiled ones."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
-        equation = Problems(problems(variant, horizon, ensemble(variant, 1))).equation
+        equation = Problems(problems(horizon, ensemble(variant, 1))).equation
         methods = [m for m in CompiledMethod.methods(equation) if not quick or m in QUICK_METHODS]
         shipped = [ShippedStepping(ShippedStepping.METHOD, 1)]
         if plan.seconds is not None:  # a constant control may be stepped with any dt
@@ -231,7 +230,7 @@ def variant_points(variant: str, family: str, quick: bool) -> Iterator[Row]:
     dt = control_step(variant)
     for horizon, plan in (QUICK if quick else HORIZONS).items():
         some, steps = truths(variant, horizon, plan), plan.steps(dt)
-        batch = problems(variant, horizon, ensemble(variant, plan.batch, vary=False))
+        batch = problems(horizon, ensemble(variant, plan.batch, vary=False))
         for mode in MODES:
             together = mode == "batch"
             base = batch if together or steps > 1 else mirrored(batch, *VARIANTS[variant].controls)

@@ -444,7 +444,7 @@ class Scene(metaclass=SceneType):
         """
         return steps.step_bound(self, state, control, dt, lag, applied)
 
-    truncation_bound = step_bound
+    truncation_bound = step_bound  # its name in 0.1
 
     @overload
     def jacobian(

@@ -208,12 +208,10 @@ def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-unty
 
 
 @cache
-def compile_advance_tangents(
-    record: SeriesRecord, columns: tuple[str, ...], guided: bool = False, tolerance: float = TOLERANCE
-) -> Callable:
+def compile_advance_tangents(record: SeriesRecord, columns: tuple[str, ...], guided: bool) -> Callable:
     """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`."""
     helpers = compile_attempt(record, 1), compile_series_tangent(record, columns)
-    numbers = _numbers(record, tolerance) | {"GUIDED": guided}
+    numbers = _numbers(record, TOLERANCE) | {"GUIDED": guided}
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)
 
@@ -346,11 +344,9 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 
 
 @cache
-def compile_pull_all(
-    record: SeriesRecord, sources: tuple[str, ...], tolerance: float = TOLERANCE, width: int | None = None
-) -> Callable:
+def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
-    width = width or lanes(record)
-    numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
+    width = lanes(record)
+    numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     return compile_python("pull_all", _pull_all, compile_pull(record, sources, width), *loops, **numbers)

@@ -35,8 +35,7 @@ class Flow(NamedTuple):
     ordinary step backwards, from cotangents of the first two variables to those of variables and
     coefficients. ``compile_tangent(present, by)`` makes the function that differentiates any step with
     respect to the variables and the named coefficients. ``order`` is the order of the certified series, 0 if
-    there is none; ``tolerance`` is the largest truncation error of θ' allowed in one step [rad/s]. ``method``
-    describes how a step is taken.
+    there is none. ``method`` describes how a step is taken.
     """
 
     size: int
@@ -48,11 +47,10 @@ class Flow(NamedTuple):
     compile: Callable
     compile_tangent: Callable
     method: str
-    tolerance: float = pendulum.TOLERANCE
 
 
 @cache
-def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLERANCE) -> Flow:
+def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
     """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
 
     def fast(variables: Sequence, drive: pendulum.Coefficients, dt: Any, xp: Any) -> tuple:
@@ -66,10 +64,9 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda variables, drive, dt, bars, xp: pendulum.pull(variables, drive, dt, bars, order),
-        lambda present: pendulum.compile_flow(present, order, tolerance),
-        lambda present, by: pendulum.compile_tangent(present, by, order, tolerance),
+        lambda present: pendulum.compile_flow(present, order),
+        lambda present, by: pendulum.compile_tangent(present, by, order),
         f"one Taylor series of order {order}, no trigonometry",
-        tolerance,
     )
 
 

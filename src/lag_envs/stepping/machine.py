@@ -205,7 +205,7 @@ class Machine:
         k, phis = self._phis(start, first, carried)
         b.cbranch(self.below(k, end), inside, after)
         b.position_at_end(inside)
-        self._again(head, k, phis, body(k, list(phis)), step)
+        self._again(k, phis, body(k, list(phis)), step)
         b.branch(head).set_metadata("llvm.loop", self._as_written())
         b.position_at_end(after)
         return phis
@@ -218,7 +218,7 @@ class Machine:
         b.position_at_end(head)
         k, phis = self._phis(start, self.index(0), carried)
         going, values = body(k, list(phis))
-        self._again(head, k, phis, values, 1)
+        self._again(k, phis, values, 1)
         b.cbranch(b.and_(going, self.below(k, self.index(times - 1))), head, after)
         b.position_at_end(after)
         return values
@@ -241,7 +241,7 @@ class Machine:
             phi.add_incoming(value, start)
         return k, phis
 
-    def _again(self, head: ir.Block, k: Any, phis: Sequence, values: Sequence, step: int) -> None:
+    def _again(self, k: Any, phis: Sequence, values: Sequence, step: int) -> None:
         k.add_incoming(self._b.add(k, ir.Constant(_INT, step)), self._b.basic_block)
         for phi, value in zip(phis, values, strict=True):
             phi.add_incoming(value, self._b.basic_block)

@@ -257,10 +257,10 @@ def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
     return (xp.abs(omega * h) <= x) & (room >= 0.0) & (a * a + b * b <= room * room)
 
 
-def largest_majorant(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
-    """Return the largest x for which one step of length dt is exact to the tolerance in θ' [rad/s].
+def largest_majorant(dt: float, order: int = ORDER) -> float:
+    """Return the largest x for which one step of length dt is exact to `TOLERANCE` in θ' [rad/s].
 
-    Solves xκ^(N+1)/(1-κ) = tolerance·dt with κ = x/2, minus a margin larger than rounding.
+    Solves xκ^(N+1)/(1-κ) = `TOLERANCE`·dt with κ = x/2, minus a margin larger than rounding.
 
     Examples
     --------
@@ -269,16 +269,14 @@ def largest_majorant(dt: float, order: int = ORDER, tolerance: float = TOLERANCE
     """
     x = 0.3
     for _ in range(60):
-        x = 2.0 * (tolerance * dt * (1.0 - x / 2.0) / x) ** (1.0 / (order + 1))
+        x = 2.0 * (TOLERANCE * dt * (1.0 - x / 2.0) / x) ** (1.0 / (order + 1))
         x = min(x, 0.5)  # the polynomials of `rotate` are exact to 0.6 rad
     return x * (1.0 - 1e-14)
 
 
-def certified_speed(
-    coeffs: Coefficients, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
-) -> float:
+def certified_speed(coeffs: Coefficients, dt: float, order: int = ORDER) -> float:
     """Return the largest |θ'| for which one series is enough [rad/s]; negative if it never is."""
-    x = largest_majorant(dt, order, tolerance)
+    x = largest_majorant(dt, order)
     if not certified(0.0, coeffs, dt, x, np):
         return -1.0
     speed = x / dt
@@ -294,22 +292,20 @@ class Bound(NamedTuple):
     theta_dot: float  # the same for θ' [rad/s]
 
 
-def truncation_bound(
-    omega: float, coeffs: Coefficients, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
-) -> Bound:
+def truncation_bound(omega: float, coeffs: Coefficients, dt: float, order: int = ORDER) -> Bound:
     """Return the number of substeps of a step and the proved bound on their truncation error.
 
-    A single series is used only if its truncation error of θ' is proved to be at most the tolerance [rad/s].
-    If not, the step is divided, and the truncation errors of all substeps together are at most the tolerance
+    A single series is used only if its truncation error of θ' is proved to be at most `TOLERANCE` [rad/s].
+    If not, the step is divided, and the truncation errors of all substeps together are at most `TOLERANCE`
     times the size of θ', max(1, |θ'|, (alpha² + beta²)^¼).
 
     Each substep's bound is proved; their sum does not account for the system's own amplification of earlier
     truncation errors. If `flow` jumps along the slow manifold (heavy damping), the count is that of the plain
     substeps that the jump replaces.
     """
-    largest = largest_majorant(dt, order, tolerance)
+    largest = largest_majorant(dt, order)
     one = certified(omega, coeffs, dt, largest, np)
-    n = 1.0 if one else min(float(_substeps(omega, *coeffs, dt, order, tolerance)), 1e15)
+    n = 1.0 if one else min(float(_substeps(omega, *coeffs, dt, order)), 1e15)
     h = dt / n
     # One step needs the bound only at its start, several need it throughout.
     x = _rate(omega, *coeffs, 0.0 if one else dt) * h
@@ -334,15 +330,15 @@ def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untype
     return max(speed, root)
 
 
-def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order, tolerance):  # type: ignore[no-untyped-def]
+def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order):  # type: ignore[no-untyped-def]
     """Return the number of substeps of a step that needs several, as a float, which may be huge.
 
-    From n · xκ^(N+1)/(1-κ)/h <= tolerance · size with x = rate h, κ = x/2 <= 0.2, h = dt/n.
+    From n · xκ^(N+1)/(1-κ)/h <= TOLERANCE · size with x = rate h, κ = x/2 <= 0.2, h = dt/n.
     """
     rate = _rate(omega, alpha, beta, gamma, delta, ramp, dt)
     size = max(1.0, max(abs(omega), (alpha * alpha + beta * beta) ** 0.25))
     half = 0.5 * rate * dt
-    n = (rate / (0.8 * tolerance * size)) ** (1.0 / order) * half ** (1.0 + 1.0 / order)
+    n = (rate / (0.8 * TOLERANCE * size)) ** (1.0 / order) * half ** (1.0 + 1.0 / order)
     return np.ceil(max(2.0, max(n, 5.0 * half)))
 
 
@@ -473,7 +469,7 @@ def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # t
     slow = layer < 0.5 * dt
     if not slow:
         layer = dt
-    n = _substeps(omega, alpha, beta, gamma, delta, ramp, layer, order, TOLERANCE)
+    n = _substeps(omega, alpha, beta, gamma, delta, ramp, layer, order)
     m = 0.0
     if slow:
         m = 1.0
@@ -510,7 +506,7 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
 
 
 @cache
-def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float = TOLERANCE) -> Callable:
+def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
     """Compile `_flow` for a pendulum that has only some of the terms.
 
     Parameters
@@ -519,8 +515,6 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
         For each coefficient of `Coefficients`, whether it is present; the others leave no code.
     order : int, default 16
         Order of the series.
-    tolerance : float, default 1e-12
-        The truncation error for which substeps are chosen [rad/s].
 
     Returns
     -------
@@ -530,7 +524,7 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
     """
     holds, series = _compile_parts(present, order)
     divided = compile_python("divided", _divided, *_divided_parts(order))
-    plan, slow = _compile_plan(tolerance), _compile_slow_motion(_no_slopes)
+    plan, slow = _compile_plan(), _compile_slow_motion(_no_slopes)
     return compile_python("flow", _flow, holds, series, plan, divided, slow, order=order)
 
 
@@ -555,9 +549,9 @@ def _compile_parts(present: tuple[bool, ...], order: int) -> tuple[Callable, Cal
 
 
 @cache
-def _compile_plan(tolerance: float) -> Callable:
-    count = compile_python("_substeps", _substeps, compile_python("_rate", _rate))
-    return compile_python("plan", _plan, count, TOLERANCE=tolerance, MAX_SUBSTEPS=MAX_SUBSTEPS)
+def _compile_plan() -> Callable:
+    count = compile_python("_substeps", _substeps, compile_python("_rate", _rate), TOLERANCE=TOLERANCE)
+    return compile_python("plan", _plan, count, MAX_SUBSTEPS=MAX_SUBSTEPS)
 
 
 @cache
@@ -643,9 +637,7 @@ def _tangent(values, slopes, scratch, dt, x):  # type: ignore[no-untyped-def]
 
 
 @cache
-def compile_tangent(
-    present: tuple[bool, ...], by: tuple[str, ...], order: int = ORDER, tolerance: float = TOLERANCE
-) -> Callable:
+def compile_tangent(present: tuple[bool, ...], by: tuple[str, ...], order: int = ORDER) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, x)``, see `_tangent`; `scratch` has four rows.
 
     Parameters
@@ -654,8 +646,8 @@ def compile_tangent(
         For each coefficient of `Coefficients`, whether it is present.
     by : tuple of str
         Coefficients that have derivatives.
-    order, tolerance : int, float
-        As for `compile_flow`.
+    order : int, default 16
+        Order of the series.
     """
     absent = frozenset(name for name, there in zip(Coefficients._fields, present, strict=True) if not there)
     columns, n = ("theta", "omega", *by), len(by) + 2
@@ -679,7 +671,7 @@ def compile_tangent(
         holds,
         compile_function("local", "\n    ".join(body) + "\n"),
         compile_python("carry", _carry, ROWS=rows),
-        _compile_plan(tolerance),
+        _compile_plan(),
         _compile_slow_motion(_slow_slopes),
         *_divided_parts(order),
         order=order,

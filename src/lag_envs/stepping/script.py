@@ -18,7 +18,7 @@ import numpy as np
 from lag_envs.stepping.driver import LARGEST_COUNT, SMALLEST_PART
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series, StepProgress
+from lag_envs.stepping.series import STRIDE, TOLERANCE, Series, StepProgress
 from lag_envs.stepping.target import GROUP, elementary
 from lag_envs.stepping.tracing import IEEE, MAGIC, Operation, TracedNumber, Value
 
@@ -457,8 +457,6 @@ class Script:
         return self.emit(record.scalars, inputs)
 
 
-#: Numbers reserved for one series.
-STRIDE = LARGEST_ORDER + 3
 _NAME = re.compile(r"\b[xyk][0-9]+\b")
 
 

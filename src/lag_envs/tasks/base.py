@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType, SimpleNamespace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,9 +26,6 @@ from lag_envs.stepping.series import check_order
 from lag_envs.tasks.formulas import UNBOUNDED, TaskFormulas, control_of
 from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
-
-if TYPE_CHECKING:
-    pass
 
 #: Largest speed of a given start, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0

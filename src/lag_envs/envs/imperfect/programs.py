@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from lag_envs.envs.imperfect.divided import DividedProgram
 from lag_envs.envs.imperfect.drawn import DrawnProgram
 from lag_envs.envs.imperfect.whole import WholeProgram
-from lag_envs.envs.program import Program, program_for
+from lag_envs.envs.program import Program, absent_from, program_for
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import Imperfections
 
 
 def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
     """Return the program of an environment, or of a batch of tasks with these constants."""
-    absent = frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
+    absent = absent_from(*constants)
     varying = frozenset(
         name for name in constants[0] if any(c[name] != constants[0][name] for c in constants)
     )
