@@ -1,6 +1,6 @@
 """What the step of a series needs of numbers: arithmetic, series in numbered slots, loops.
 
-`Target` lists the operations. `Plain` carries them out on Python numbers; others print them
+`Target` lists the operations. `Plain` carries them out on floats; others print them
 (`lag_envs.stepping.machine`, `lag_envs.stepping.script`).
 """
 
@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.lowering import FUNCTIONS, SeriesRecord
+from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.tracing import MAGIC, Operation, evaluate_operations
 
 #: How many products are summed side by side in one loop, where registers are no concern.
@@ -90,24 +90,15 @@ class Target(Protocol):
 
 
 class Plain:
-    """The target that computes at once, on numbers of any kind: floats, or others with functions in `xp`.
-
-    On floats its results are those of the unfused print, bit for bit.
-    """
+    """The target that computes at once, on floats, with the bits of the unfused print."""
 
     group = GROUP
 
-    def __init__(self, slots: int, number: Callable = float, xp: Any = None) -> None:
-        self._memory: list[dict[int, Any]] = [{} for _ in range(slots)]
-        self.number = number
-        self._functions: Any = None
-        if xp is not None:
-            self._functions = {name: getattr(xp, name) for name in (*FUNCTIONS, "sqrt")}
-            self._functions |= {
-                "a*b+c": lambda a, b, c: a * b + c,
-                "a*b-c": lambda a, b, c: a * b - c,
-                "c-a*b": lambda a, b, c: c - a * b,
-            }
+    def __init__(self, slots: int) -> None:
+        self._memory: list[dict[int, float]] = [{} for _ in range(slots)]
+
+    def number(self, value: float) -> float:
+        return float(value)
 
     def add(self, a: Any, b: Any) -> Any:
         return a + b
@@ -122,7 +113,7 @@ class Plain:
         try:
             return a / b
         except ZeroDivisionError:
-            return a * math.copysign(math.inf, b) if a == a and a != 0 else self.number(math.nan)
+            return a * math.copysign(math.inf, b) if a == a and a != 0 else math.nan
 
     def fma(self, a: Any, b: Any, c: Any) -> Any:
         return a * b + c
@@ -134,8 +125,6 @@ class Plain:
         return abs(a)
 
     def sqrt(self, a: Any) -> Any:
-        if self._functions is not None:
-            return self._functions["sqrt"](a)
         return math.sqrt(a) if a >= 0 else math.nan
 
     def less(self, a: Any, b: Any) -> bool:
@@ -157,10 +146,10 @@ class Plain:
         return a if condition else b
 
     def real(self, k: int) -> Any:
-        return self.number(k)
+        return float(k)
 
     def reciprocal(self, k: int) -> Any:
-        return self.number(1) / self.number(k)
+        return 1.0 / k
 
     def index(self, k: int) -> int:
         return k
@@ -201,10 +190,8 @@ class Plain:
         return body() if condition else list(otherwise)
 
     def elementary(self, name: str, x: Any) -> Any:
-        if self._functions is not None:
-            return self._functions[name](x)
         operations, result = elementary(name, fused=False)
         return evaluate_operations(operations, {"x": x})[result]
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
-        return evaluate_operations(record.scalars, inputs, self._functions)
+        return evaluate_operations(record.scalars, inputs)
