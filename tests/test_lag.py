@@ -27,7 +27,7 @@ from lag_envs.scenes.checks import SMALLEST_LAG
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.stepping import driver, general
 from lag_envs.stepping.certificate import Certificate
-from lag_envs.stepping.compiling import BLOCK
+from lag_envs.stepping.compiling import BLOCK, absent_from
 from lag_envs.stepping.driver import compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
@@ -174,8 +174,7 @@ class Case(NamedTuple):
 
 def code_of(scene, fused=True):
     constants = motion_constants_of(scene, lagged=True)
-    absent = frozenset(name for name, value in constants.items() if value == 0.0)
-    code = lagged_stepper(scene.mechanics).code(absent, fused)
+    code = lagged_stepper(scene.mechanics).code(absent_from(constants), fused)
     return code, [constants[name.removeprefix("k_")] for name in code.constants]
 
 

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.envs.program import absent_from, program_for
+from lag_envs.envs.program import program_for
 from lag_envs.envs.reverse import Reverse
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.scenes.derivation import form_of
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]

@@ -44,11 +44,6 @@ def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = fro
 _programs: dict[tuple, Program] = {}
 
 
-def absent_from(*constants: dict[str, float]) -> frozenset[str]:
-    """Return the names of the constants that are zero in all environments: they leave no code."""
-    return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
-
-
 class Program:
     """The compiled functions of a task.
 

@@ -50,6 +50,7 @@ from lag_envs.scenes import picture
 from lag_envs.scenes.base import ORDER
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
 from lag_envs.scenes.shapes import Frame
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.general import stepper_of, usual_order
@@ -142,7 +143,7 @@ class UnfusedProgram:
         # Functions of parameters must have the same bits everywhere, too.
         parameters, functions = parameter_values(scene), ElementaryTrace()
         motion = self._stepper.constants(parameters, functions)
-        gone = frozenset(name for name, value in motion.items() if value == 0.0)
+        gone = absent_from(motion)
         self.derived = self._form.constants(parameters, functions) if self._form else {}
         self.derived |= {f"motion_{name}": value for name, value in motion.items()}
         numbers = self.given | self.derived

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lag_envs import TASKS
-from lag_envs.envs.program import Program, absent_from
+from lag_envs.envs.program import Program
 from lag_envs.report.cases import Case
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.integrators import plain_series
@@ -19,6 +19,7 @@ from lag_envs.report.timing import FlowSteps, at_once, interleaved
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import form_of
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.tasks.base import Task
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.flows import Flow, Stepper
 
 
@@ -74,8 +75,7 @@ class Stepped:
 
     def stepper(self) -> Stepper:
         """Return the code of a step, without the constants that are zero."""
-        absent = frozenset(name for name, value in self.constants().items() if value == 0.0)
-        return Stepper(self.form, self.flow, absent)
+        return Stepper(self.form, self.flow, absent_from(self.constants()))
 
     def present(self) -> list[float]:
         """Return the constants of the code."""

@@ -116,6 +116,8 @@ def step_argument_of(scene: Scene, dt: float, lagged: bool = False) -> float:
 
 def code_of(scene: Scene, dt: float, lagged: bool = False) -> Any:
     """Return the code of a control step."""
-    absent = frozenset(name for name, value in motion_constants_of(scene, lagged).items() if value == 0.0)
+    from lag_envs.stepping.compiling import absent_from
+
+    absent = absent_from(motion_constants_of(scene, lagged))
     form = None if lagged else form_of(scene)
     return form.stepper(dt, absent) if form else _stepper(scene, lagged).code(absent)

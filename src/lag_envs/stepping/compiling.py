@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any
 
@@ -102,6 +102,11 @@ def compile_function(
     namespace |= {block: primitives.block(*_blocks[block]) for block in re.findall(_BLOCK, source)}
     exec(code, namespace)
     return jit(namespace[unique], unique, inner)
+
+
+def absent_from(*constants: Mapping[str, float]) -> frozenset[str]:
+    """Return the names of the constants that are zero in all of the given ones: they leave no code."""
+    return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
 def compile_python(

@@ -20,7 +20,7 @@ from lag_envs.mechanics.evaluation import eliminated, exactly
 from lag_envs.mechanics.layout import Prescribed
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter, parameter_values
-from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.compiling import absent_from, compile_function, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
@@ -634,7 +634,7 @@ def series_code_of(scene: Any) -> tuple[StepCode, list[float]]:
     """Return the code with which the general series steps a scene, and the constants that it takes."""
     stepper = stepper_of(scene.mechanics)
     constants = stepper.constants(parameter_values(scene))
-    code = stepper.code(frozenset(name for name, value in constants.items() if value == 0.0))
+    code = stepper.code(absent_from(constants))
     return code, [constants[name.removeprefix("k_")] for name in code.constants]
 
 

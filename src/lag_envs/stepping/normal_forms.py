@@ -30,6 +30,7 @@ from lag_envs.mechanics.layout import SceneLayout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
 
@@ -231,7 +232,7 @@ class NormalForm:
 
     def _stepper(self, dt: float, constants: Mapping[str, float]) -> tuple[Stepper, frozenset[str]]:
         """Return the code of a step with these constants, and the names of those that are zero."""
-        absent = frozenset(name for name, value in constants.items() if value == 0.0)
+        absent = absent_from(constants)
         return self.stepper(dt, absent), absent
 
     # --- what depends on numbers ---------------------------------------------------------------------------

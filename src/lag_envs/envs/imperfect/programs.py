@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from lag_envs.envs.imperfect.divided import DividedProgram
 from lag_envs.envs.imperfect.drawn import DrawnProgram
 from lag_envs.envs.imperfect.whole import WholeProgram
-from lag_envs.envs.program import Program, absent_from, program_for
+from lag_envs.envs.program import Program, program_for
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import Imperfections
 
