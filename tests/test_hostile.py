@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rollouts import IDS, actions, make, trace
 
-from lag_envs.envs.single import check_seed, seed_key
+from lag_envs.envs.interface import check_seed, seed_key
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 

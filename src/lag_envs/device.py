@@ -17,8 +17,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from lag_envs import nvrtc
+from lag_envs.envs.interface import seed_key, start_options
 from lag_envs.envs.kernels import APART, kernels_of
-from lag_envs.envs.single import seed_key, start_options
 from lag_envs.envs.vector import LagrangianVectorEnv, for_environment, seeds_of
 from lag_envs.scenes.checks import check_count
 from lag_envs.stepping.cache import kept

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.envs.single import observation_space
+from lag_envs.envs.interface import observation_space
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tables import aligned

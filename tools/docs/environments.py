@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lag_envs.envs.actions import Actions
-from lag_envs.envs.single import observation_space
+from lag_envs.envs.interface import observation_space
 from lag_envs.leaderboard.docs import plain_markdown
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene

@@ -42,8 +42,8 @@ import numpy as np
 
 from lag_envs.envs.actions import Actions
 from lag_envs.envs.imperfect.draws import PURPOSES
+from lag_envs.envs.interface import seed_key
 from lag_envs.envs.program import DRAWS
-from lag_envs.envs.single import seed_key
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values
 from lag_envs.scenes import picture

@@ -18,8 +18,7 @@ from lag_envs.envs import sharing, snapshots
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
-from lag_envs.envs.program import BLOCK
-from lag_envs.envs.single import (
+from lag_envs.envs.interface import (
     FLOAT32,
     check_flag,
     check_look,
@@ -31,6 +30,7 @@ from lag_envs.envs.single import (
     start_options,
     true_spec,
 )
+from lag_envs.envs.program import BLOCK
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
 from lag_envs.scenes.derivation import form_of
