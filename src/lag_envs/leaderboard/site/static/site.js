@@ -70,12 +70,12 @@
   const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
   const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
 
-  /** "theta_dot", "theta_1_dot" or "psi''" as on paper. */
+  /** "theta_dot", "theta_1_dot" or "psi''" as on paper, "elbow_torque" as words. */
   function symbol(name) {
     const [, base, index = "", rate = ""] = name.match(/^(.+?)(?:_(\d+))?(_d+ot|'+)?$/) ?? ["", name];
     const dots = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
     const lower = index.replace(/\d/g, (digit) => String.fromCharCode(0x2080 + Number(digit)));
-    return (GREEK[base] ?? base) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
+    return (GREEK[base] ?? base.replace(/_/g, " ")) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
   }
 
   // --- scenes ----------------------------------------------------------------------------------------------
