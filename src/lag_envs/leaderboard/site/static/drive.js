@@ -822,7 +822,7 @@
     const cells = new Map();
 
     function readOut(beside) {
-      const score = known ? (finished(me) ? text(scoreOf(me.total)) : "at the end") : "–";
+      const score = known && (finished(me) ? text(scoreOf(me.total)) : !ended() && "at the end") || "–";
       const keys = rerunning ? rerunning.keys[Math.max(0, me.steps - 1)] ?? [] : mine[mine.length - 1] ?? [];
       const entries = [
         ["Time", `${text(me.steps * about.dt, 2)} s`],
@@ -863,7 +863,7 @@
     const inputs = about.sliders.map((slider) => {
       const input = make("input", { type: "range", min: "-1", max: "1", step: "0.01", value: "0" });
       const output = make("output");
-      const name = slider.name.replace(/_/g, " ");
+      const name = slider.name.replace(/^com_/, "centre-of-mass ").replace(/_/g, " ");
       const say = () => {
         const value = slider.value * 2 ** Number(input.value);
         output.textContent = `${+(value * (slider.shown ?? 1)).toPrecision(3)} ${slider.unit}`;
