@@ -65,8 +65,8 @@ COLUMNS = (
     Column(
         "score",
         "Score",
-        "Interquartile mean, over training seeds, of the mean over episodes. 0 is the random policy's return, 1 "
-        "the best known. The bar is the 95 % bootstrap interval.",
+        "Interquartile mean, over training seeds, of the mean over episodes. 0 is the random policy's return, "
+        "1 the best known. The bar is the 95 % bootstrap interval.",
     ),
     Column("return", "Return", "Mean return of an episode."),
     Column(
@@ -79,8 +79,8 @@ COLUMNS = (
     Column(
         "settle",
         "Settle",
-        "Median time until the goal is reached for good, over all episodes; missing if half of them never reach "
-        "it.",
+        "Median time until the goal is reached for good, over all episodes; missing if half of them never "
+        "reach it.",
         True,
     ),
     Column("effort", "Effort", "Mean square of the action.", True),
@@ -89,8 +89,8 @@ COLUMNS = (
     Column(
         "robustness",
         "Robust",
-        "Lowest score in changed environments: with other masses, drag and the like, and on newer boards also "
-        "with noise, delays and pushes.",
+        "Lowest score in changed environments: with other masses, drag and the like, and on newer boards "
+        "also with noise, delays and pushes.",
     ),
     Column("often", "10 × rate", "Score when the agent acts ten times as often."),
 )
@@ -299,9 +299,8 @@ def _goals(goal: str | None) -> dict[str, str]:
     """
     if not goal:
         return {}
-    success, _, time = re.sub(", and time: ", "; time: ", goal.removeprefix("success: ")).partition(
-        "; time: "
-    )
+    joined = goal.removeprefix("success: ").replace(", and time: ", "; time: ")
+    success, _, time = joined.partition("; time: ")
     time = time.removeprefix("until it is so for good").removeprefix(", ")
     return {"success": success.removesuffix("; there is no time")} | ({"settle": time} if time else {})
 

@@ -44,8 +44,8 @@ def scenery_data(env_id: str) -> dict[str, Any]:
         ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``open`` (None, or ``knows``,
         ``share`` and ``tried``: method, budget, return), ``state_names``, ``state_units``, ``pairs`` (the
         entries that are a coordinate and its rate), ``controls`` (those that actions set), ``dt`` [s] and
-        ``picture`` (None if the scene has no bodies). Empty for an id that this version does not have, such as a
-        frozen board's.
+        ``picture`` (None if the scene has no bodies). Empty for an id that this version does not have, such
+        as a frozen board's.
 
     Examples
     --------
