@@ -430,7 +430,7 @@ def test_a_changed_machine_is_not_scored(drive):
     page = drive("PivotedBar-v0")
     page.click(".sliders summary")
     names = page.evaluate("[...document.querySelectorAll('.sliders label span')].map((e) => e.textContent)")
-    assert names == ["mass", "com distance", "damping", "gravity", "track", "control limit"]
+    assert names == ["mass", "centre-of-mass distance", "damping", "gravity", "track", "control limit"]
     before = page.evaluate("document.querySelector('.driver .scene').toDataURL()")
     outputs = page.evaluate("[...document.querySelectorAll('.sliders output')].map((e) => e.textContent)")
     assert outputs[-1] == "5 m/s²"
@@ -700,6 +700,7 @@ def test_ghosts_run_beside(drive, haunted):
     until(page, f"location.hash === '#seed={2**61 + 3}'")
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
+    assert page.evaluate("document.activeElement.className") == "stage"
 
 
 # --- speed --------------------------------------------------------------------------------------------------

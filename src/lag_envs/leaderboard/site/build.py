@@ -65,8 +65,8 @@ COLUMNS = (
     Column(
         "score",
         "Score",
-        "Interquartile mean, over training seeds, of the mean over episodes. 0 is the random policy's return, "
-        "1 the best known. The bar is the 95 % bootstrap interval.",
+        "Interquartile mean, over training seeds, of the mean over episodes. 0 is the random policy's "
+        "return, 1 the best known. The bar is the 95 % bootstrap interval.",
     ),
     Column("return", "Return", "Mean return of an episode."),
     Column(
