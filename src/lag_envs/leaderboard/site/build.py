@@ -83,7 +83,7 @@ COLUMNS = (
         "reach it.",
         True,
     ),
-    Column("effort", "Effort", "Mean square of the action.", True),
+    Column("effort", "Effort", "Mean square of the control, as a share of its limit.", True),
     Column("env_steps", "Steps", "Environment steps taken in training, as stated by the authors.", True),
     Column("seconds", "Training", "Time taken by training, as stated by the authors.", True),
     Column(
