@@ -31,6 +31,7 @@ BARE = (
     pivoted_bar.SwingUp.id,
     pivoted_bar.Balance.id,
     incline.Tilt.id,
+    incline.Brake.id,
     cylinder_in_cylinder.Tilt.id,
 )
 #: Plays actions in the page and returns the bits of all results.
@@ -204,10 +205,12 @@ def test_by_keys_alone(drive, capsys):
     page.keyboard.up("ArrowRight")
     page.keyboard.press("Space")
     assert message(page).startswith("Paused at 0.")
+    assert reading(page, "Score") == "at the end"
     held = link_of(page)
     assert replay.read_link(held).seed == 12
     assert cli.main(["replay", held]) == 0
-    assert "stopped before its end" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "stopped before its end" in said and "score" not in said
     page.keyboard.press("Space")
     page.keyboard.down("ArrowRight")
     until(page, "/The episode has ended|Time is up/.test(document.querySelector('.message').textContent)")
@@ -217,7 +220,7 @@ def test_by_keys_alone(drive, capsys):
     said = capsys.readouterr().out
     assert "terminated" in said and "true: every bit" in said
     score = float(said.split("score ")[1].split()[0])
-    assert float(reading(page, "Score so far").replace("−", "-")) == pytest.approx(score, abs=1e-3)
+    assert float(reading(page, "Score").replace("−", "-")) == pytest.approx(score, abs=1e-3)
     page.keyboard.press("r")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
     assert page.evaluate("location.hash") == "#seed=12"
@@ -247,14 +250,68 @@ def test_a_link_is_recomputed_in_the_page(drive, link):
     assert page.evaluate("[...document.querySelectorAll('.drive-controls select')][1].value") == "link:0"
     page.select_option(".drive-controls select >> nth=0", "1")
     page.click(".rerun")
-    until(page, "document.querySelector('.message').textContent.includes('R: again')")
+    until(page, "document.querySelector('.message').textContent.includes('R: drive from')")
     assert float(reading(page, "Return").replace("−", "-")) == pytest.approx(link.claimed, abs=6e-3)
-    # With its last bit changed, it is false; and so it is with one key more.
-    longer = replay.pack([*replay.unpack(link.keys, 1), (0,)])
-    for changed in ({"claimed": np.nextafter(link.claimed, np.inf)}, {"keys": longer}):
-        page = drive(link.id, replay.write_link(link._replace(**changed)))
-        until(page, "document.querySelector('.verdict').dataset.true === 'false'")
-        assert verdict(page).startswith("The link is false")
+    assert reading(page, "Score") not in ("–", "at the end")
+    # With its last bit changed, it is false, and all digits say so.
+    other = float(np.nextafter(link.claimed, np.inf))
+    page = drive(link.id, replay.write_link(link._replace(claimed=other)))
+    until(page, "document.querySelector('.verdict').dataset.true === 'false'")
+    assert verdict(page).replace("−", "-") == (
+        f"The link is false: it claims a return of {other!r}, but its keys give {link.claimed!r}."
+    )
+
+
+def test_a_link_with_a_key_after_the_end_is_forged_for_page_and_command(drive, link, capsys):
+    keys = replay.unpack(link.keys, 1)
+    longer = replay.write_link(link._replace(keys=replay.pack([*keys, (0,)])))
+    page = drive(link.id, longer)
+    until(page, "document.querySelector('.verdict').dataset.true === 'false'")
+    n = len(keys)
+    assert verdict(page) == (
+        f"The link is forged: its episode ends after {n} steps, but it has keys for {n + 1}."
+    )
+    assert cli.main(["replay", longer]) == 2
+    assert f"the episode ends after {n} steps, the link has {n + 1}: it is forged" in capsys.readouterr().err
+
+
+def test_part_of_an_episode_has_no_score(drive):
+    """Where all rewards are costs, the first steps have a better return than the best policy's episode."""
+    task = TASKS[incline.Brake.id]()
+    env = Unfused(task)
+    env.reset(3)
+    total = sum(env.step(replay.action_from_numbers((0,), task))[1] for _ in range(9))
+    part = replay.Drive(task.id, 3, replay.pack([(0,)] * 9), total, env.program.digest)
+    assert replay.replay(part).true and replay.replay(part).score is None
+    page = drive(task.id, replay.write_link(part))
+    until(page, "document.querySelector('.verdict').dataset.true === 'true'")
+    assert "score " not in verdict(page) and "no score" in verdict(page)
+    page.click(".rerun")
+    until(page, "document.querySelector('.message').textContent.startsWith(\"The link's keys end here\")")
+    assert "score" not in message(page) and reading(page, "Score") == "–"
+
+
+def test_while_watching_the_keys_are_said_to_be_silent(drive, link):
+    """After the end, the button and the keys start a drive of one's own on the same start."""
+    half = replay.unpack(link.keys, 1)[:30]
+    env = Unfused(TASKS[link.id]())
+    env.reset(link.seed)
+    total = sum(env.step(replay.action_from_numbers(key, env.task))[1] for key in half)
+    page = drive(link.id, replay.write_link(link._replace(keys=replay.pack(half), claimed=total)))
+    until(page, "document.querySelector('.verdict').dataset.true === 'true'")
+    assert page.evaluate("document.activeElement.className") == "stage"
+    page.click(".rerun")
+    assert message(page).startswith("Watching the link's drive: you do not steer")
+    assert page.evaluate("document.activeElement.className") == "stage"
+    until(page, "document.querySelector('.message').textContent.includes('R: drive from this start')")
+    assert page.evaluate("document.querySelector('.go').textContent") == "Start again"
+    page.click(".go")
+    until(page, "document.querySelector('.go').textContent === 'Pause'")
+    assert message(page) == ""
+    page.wait_for_timeout(200)
+    page.keyboard.press("Space")
+    mine = replay.read_link(link_of(page))
+    assert mine.seed == link.seed and set(replay.unpack(mine.keys, 1)) == {(0,)}
 
 
 def test_after_a_false_link_one_drives_on_its_start(drive, link):
@@ -295,13 +352,16 @@ def test_another_link_or_seed_may_follow_a_link(drive, link):
 IMPOSSIBLE = [
     ({"step": "00000000"}, "another version"),
     ("#drive=1~x", "damaged"),
-    slow("#drive=%E0%A4%A", "not the link of a drive"),
+    slow("#drive=%E0%A4%A", "not a link to a drive"),
     slow("#drive=2~a~b~c~d~e~f", "version"),
     slow({"id": "PivotedBar-v0"}, "another environment"),
     slow({"seed": 2**64}, "forged"),
     slow({"keys": replay.pack([(65,)])}, "between -64 and 64"),
     slow({"keys": "gA"}, "damaged"),
     slow({"keys": ""}, "no step"),
+    ({"claimed": np.nan}, "not a finite number"),
+    slow({"claimed": -np.inf}, "not a finite number"),
+    slow({"claimed": -0.0}, "claims a return of −0, but"),
     slow({"keys": "gAECB"}, "forged"),
     slow("#seed=99999999999999999999", "below 2"),
 ]
@@ -333,11 +393,11 @@ def test_by_pointer_and_by_touch(drive, browsing):
         page,
         "document.querySelector('.driver .readout') && document.querySelector('.go').textContent === 'Pause'",
     )
-    shows(page, "φ\u0307", "1.00")
+    shows(page, "φ\u0307", "0.300 rad/s")
     page.mouse.move(box[0] + 0.29 * box[2], middle)
-    shows(page, "φ\u0307", "−0.50")
+    shows(page, "φ\u0307", "−0.150 rad/s")
     page.mouse.up()
-    shows(page, "φ\u0307", "0.00")
+    shows(page, "φ\u0307", "0.000 rad/s")
     page.keyboard.press("Space")
     assert cli.main(["replay", link_of(page)]) == 0
 
@@ -357,7 +417,7 @@ def test_a_gamepad_drives_and_may_leave(drive):
     page.evaluate(GAMEPAD)
     assert "A gamepad is connected" in message(page)
     page.click(".go")
-    shows(page, "φ\u0307", "0.50")
+    shows(page, "φ\u0307", "0.150 rad/s")
     page.evaluate("window.pad.connected = false")
     until(page, "document.querySelector('.message').textContent.startsWith('The gamepad is disconnected')")
     assert page.evaluate("document.querySelector('.go').textContent") == "Resume"
@@ -370,8 +430,10 @@ def test_a_changed_machine_is_not_scored(drive):
     page = drive("PivotedBar-v0")
     page.click(".sliders summary")
     names = page.evaluate("[...document.querySelectorAll('.sliders label span')].map((e) => e.textContent)")
-    assert names == ["mass", "com distance", "damping", "gravity", "track", "control limit"]
+    assert names == ["mass", "centre-of-mass distance", "damping", "gravity", "track", "control limit"]
     before = page.evaluate("document.querySelector('.driver .scene').toDataURL()")
+    outputs = page.evaluate("[...document.querySelectorAll('.sliders output')].map((e) => e.textContent)")
+    assert outputs[-1] == "5 m/s²"
     page.evaluate(
         "(() => { const i = document.querySelectorAll('.sliders input')[1]; i.value = '1';"
         "i.dispatchEvent(new Event('input')); })()"
@@ -382,7 +444,7 @@ def test_a_changed_machine_is_not_scored(drive):
     page.keyboard.press("Space")
     page.wait_for_timeout(200)
     page.keyboard.press("Space")
-    assert reading(page, "Score so far") == "not scored"
+    assert reading(page, "Score") == "not scored"
     assert page.evaluate("document.querySelector('.share').hidden")
     page.click(".reset")
     assert "scored again" in message(page)
@@ -405,13 +467,13 @@ def test_two_controls_without_a_picture(drive, owned):
     assert "← → push, ↓ ↑ pull" in message(page) and "nothing to draw" in message(page)
     for key in ("ArrowRight", "ArrowUp"):
         page.keyboard.down(key)
-    shows(page, "push", "1.00")
-    shows(page, "pull", "1.00")
-    assert reading(page, "Score so far") == "–"
+    shows(page, "push", "20.00 N")
+    shows(page, "pull", "20.00 N")
+    assert reading(page, "Score") == "–"
     page.keyboard.up("ArrowUp")
     page.wait_for_timeout(300)
     if not message(page):
-        assert reading(page, "pull") == "−1.00"  # nothing is pulled there
+        assert reading(page, "pull") == "0.00 N"
 
 
 def test_choices(drive, owned):
@@ -629,7 +691,7 @@ def test_ghosts_run_beside(drive, haunted):
     page.focus(".stage")
     page.keyboard.press("Space")
     until(page, "parseFloat(document.querySelector('.driver .readout dd').textContent) > 0.3")
-    assert reading(page, "Ghost") not in (None, "–")
+    assert reading(page, "Ghost's return") not in (None, "–")
     page.select_option(ghosts, "stored:1")
     until(page, "!document.querySelectorAll('.drive-controls label')[2].hidden")
     until(page, "document.querySelector('.go').textContent === 'Start'")
@@ -638,6 +700,7 @@ def test_ghosts_run_beside(drive, haunted):
     until(page, f"location.hash === '#seed={2**61 + 3}'")
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
+    assert page.evaluate("document.activeElement.className") == "stage"
 
 
 # --- speed --------------------------------------------------------------------------------------------------

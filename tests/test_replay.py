@@ -64,7 +64,7 @@ def test_a_claim_in_its_last_bit_is_false():
 
 def test_a_drive_may_stop_before_its_end():
     found = replay.replay(short())
-    assert found.true and not found.finished
+    assert found.true and not found.finished and found.score is None
 
 
 @cache
@@ -102,6 +102,8 @@ def altered(field, value):
         (altered(3, replay.pack([(64,)] * 3000)), "the episode ends after"),
         (altered(3, replay.pack([(0,)]) [:2] + "A"), "an empty run"),
         (altered(4, "12"), "16 hexadecimal"),
+        (altered(4, "7ff8000000000000"), "a finite number, got nan"),
+        (altered(4, "fff0000000000000"), "a finite number, got -inf"),
         (altered(5, "x"), "8 hexadecimal"),
         (altered(5, "00000000"), "another step"),
         (altered(1, "x" * 300_000), "characters, at most"),

@@ -14,7 +14,7 @@ from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import render, write_page
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
 from lag_envs.scenes.picture import Picture
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum
 from tests import board_pages
 from tests.board_pages import HOSTILE, clean
 
@@ -95,12 +95,11 @@ def test_likeness_of_acts_and_of_names_is_shown():
     pages, _ = render(found)
     page = pages[f"{incline.Brake.id}.html"]
     ranks = re.findall(r'class="rank">([^<]*)<', page)
-    assert ranks[0] == "–" and page.count(">acts like") == 1 and page.count("though it looks the same") == 1
+    assert ranks[0] == "–" and page.count(">acts like") == 1 and page.count("not to be confused with") == 1
     assert 'acts like <span dir="auto">The &lt;first&gt;</span>' in page
     assert "(withdrawn)" in pages[f"{incline.Brake.id}-00000000.html"]
-    assert (
-        'not <span dir="auto">P\u0420O &amp; co</span>' in page and '<span class="remark">reference<' in page
-    )
+    assert 'confused with <span dir="auto">P\u0420O &amp; co</span>' in page
+    assert '<span class="remark">reference<' in page
     index = pages["index.html"]
     assert "9 ranked agents" in index and f"<bdi>{rows[1]['name']}</bdi>" in index  # the best with a rank
 
@@ -136,10 +135,42 @@ def test_submissions_are_linked_where_their_files_are_public():
     found = board_pages.data((incline.Brake.id,))
     row = found["environments"][0]["rows"][0]
     row |= {"id": "made/by hand", "module": "lag_envs.controllers.basic", "code": None}
+    found["environments"][0]["rows"][1] |= {"module": "lag_envs.controllers", "code": None}
+    found["environments"][0]["rows"][2] |= {"module": "lag_envs.gone", "code": None}
     main = "https://example.org/main/"
-    for link in ("leaderboard/submissions/made/by%20hand", "src/lag_envs/controllers/basic.py"):
-        assert any(f'href="{main}{link}"' in text for text in render(found, source=main)[0].values())
-        assert not any(link in text for text in render(found)[0].values())
+    there, without = "".join(render(found, source=main)[0].values()), "".join(render(found)[0].values())
+    for link in ("leaderboard/submissions/made/by%20hand", "src/lag_envs/controllers/basic.py",
+                 "src/lag_envs/controllers/__init__.py"):  # fmt: skip
+        assert f'href="{main}{link}"' in there and link not in without
+    linked = re.findall(f'href="{main}(src/[^"]+)"', there)
+    assert len(linked) == 2 and all((site.PACKAGE.parents[1] / link).is_file() for link in linked)
+
+
+def test_numbers_of_a_column_line_up():
+    found = board_pages.data((incline.Tilt.id,))
+    rows = found["environments"][0]["rows"]
+    for row, success in zip(rows, (1.0, 0.875, 0.0), strict=False):
+        row |= {"success": {"rate": success, "low": success, "high": success}, "settle": success}
+    page = render(found)[0][f"{incline.Tilt.id}.html"]
+    for column, digits in (("return", 1), ("success", 1), ("settle", 2), ("gap", 3)):
+        shown = re.findall(f'<td role="cell" class="{column}"[^>]*>([^<]*)', page)
+        ends = {text.partition(".")[2].partition("\N{NO-BREAK SPACE}")[0] for text in shown if text != "–"}
+        assert len(shown) == len(rows) and {len(end) for end in ends} == {digits}, (column, shown)
+
+
+def test_texts_of_records_lose_their_markup():
+    """A paragraph with a footnote or emphasis; goals in parts; parameters' names as words."""
+    found = board_pages.data((pendulum.PendulumRegret.id,), board_pages.AGENTS[:1])
+    board = found["environments"][0]
+    board["goal"] = "success: upright throughout; time: until then"
+    board["rows"][0]["robustness"] = {"mass_1 -20 %": 0.5, "late by a step": 0.4}
+    pages = render(found)[0]
+    page, own = (text for name, text in pages.items() if name.startswith(board["id"]))
+    page, own = (page, own) if "Ranking" in page else (own, page)
+    assert "converse optimality [1])" in page and "<p>[1] J. C. Doyle" in page
+    for text in (page, own):
+        assert "Here: upright throughout.</dd>" in text and "Here: until then.</dd>" in text
+    assert "mass 1, −20 %" in own and "actions a step late" in own
 
 
 def test_frozen_boards_stand_apart():

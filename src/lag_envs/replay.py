@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import base64
 import binascii
+import math
 import re
 import struct
 import zlib
@@ -79,7 +80,8 @@ class Replayed(NamedTuple):
     terminated : bool
         Whether it terminated before the time limit.
     score : float or None
-        On the board's scale, if the environment has one.
+        On the board's scale, if the environment has one and the episode is finished. A part of an episode has
+        no score: where rewards are costs, it would look too good.
     """
 
     total: float
@@ -136,13 +138,16 @@ def read_link(link: str) -> Drive:
         )
     if not re.fullmatch(r"[0-9a-f]{16}", claimed):
         raise LinkError(f"the link's return must be 16 hexadecimal digits, got {_short(claimed)}")
+    total = struct.unpack(">d", bytes.fromhex(claimed))[0]
+    if not math.isfinite(total):
+        raise LinkError(f"the link's return must be a finite number, got {total}")
     if not re.fullmatch(r"[0-9a-f]{8}", step):
         raise LinkError(f"the link's digest must be 8 hexadecimal digits, got {_short(step)}")
     if not re.fullmatch(r"[A-Za-z0-9_-]*", keys):
         raise LinkError("the link's keys hold characters that base64url does not have")
     if not keys:
         raise LinkError("the link's drive has no step")
-    return Drive(id, int(seed), keys, struct.unpack(">d", bytes.fromhex(claimed))[0], step)
+    return Drive(id, int(seed), keys, total, step)
 
 
 def replay(drive: Drive | str, task: Any = None) -> Replayed:
@@ -192,7 +197,8 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
             raise LinkError(f"step {i + 1} cannot be taken: {error}") from error
         total, over = total + reward, terminated or truncated
     true = struct.pack(">d", total) == struct.pack(">d", drive.claimed)
-    return Replayed(total, true, over, terminated, score(drive.id, total) if drive.id in TASKS else None)
+    scored = score(drive.id, total) if over and drive.id in TASKS else None
+    return Replayed(total, true, over, terminated, scored)
 
 
 def action_from_numbers(key: Sequence[int], task: Any) -> Any:

@@ -26,12 +26,21 @@ from lag_envs.leaderboard.site.scenery import Scenery, scenery_data
 #: Lists the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
 STATIC = Path(__file__).parent / "static"
+PACKAGE = Path(__file__).parents[2]
 #: Poses of one episode in an overview's picture.
 POSES = 15
 #: Entries of the feed.
 NEWS = 50
 ABOUT = "Leaderboard of lag_envs: every score is recomputed from a policy that contains only data."
 
+#: Conditions of robustness in words that need no context.
+CONDITIONS = {
+    "noise": "sensor noise",
+    "late by a step": "actions a step late",
+    "lag of two steps": "actuators with a lag of two steps",
+    "pushes": "random pushes",
+    "hidden, within 20 %": "unknown parameters, within 20 %",
+}
 KINDS = {"learned": "Learned", "controller": "Controller", "optimal": "Optimal"}
 
 
@@ -48,31 +57,42 @@ COLUMNS = (
     Column(
         "rank",
         "Rank",
-        "Agents share a rank if it is not clear which of them is better. One that acts like an earlier "
-        "one has none.",
+        "Agents share a rank if it is not clear which of them is better. An agent that acts like an earlier "
+        "one has no rank.",
         True,
     ),
-    Column("name", "Agent", "The submission's name, and who submitted it.", True),
+    Column("name", "Agent", "The submission's name and kind.", True),
     Column(
         "score",
         "Score",
-        "Interquartile mean over training seeds and episodes, 0 for the random policy, 1 for the best known "
-        "return; the bar is the 95 % bootstrap interval.",
+        "Interquartile mean, over training seeds, of the mean over episodes. 0 is the random policy's "
+        "return, 1 the best known. The bar is the 95 % bootstrap interval.",
     ),
-    Column("return", "Return", "Mean return of an episode, in the environment's own reward."),
-    Column("gap", "Gap", "Optimality gap: by how much runs fall short of a score of 1, on average.", True),
+    Column("return", "Return", "Mean return of an episode."),
+    Column(
+        "gap",
+        "Gap",
+        "Optimality gap: how far policies fall short of a score of 1, on average over training seeds.",
+        True,
+    ),
     Column("success", "Success", "Share of episodes that succeed, with Wilson's 95 % interval."),
-    Column("settle", "Settle", "Median time until the goal is reached for good.", True),
-    Column("effort", "Effort", "Mean square of the action.", True),
-    Column("env_steps", "Steps", "Environment steps used for training, as stated by the authors.", True),
-    Column("seconds", "Training", "Time used for training, as stated by the authors.", True),
+    Column(
+        "settle",
+        "Settle",
+        "Median time until the goal is reached for good, over all episodes; missing if half of them never "
+        "reach it.",
+        True,
+    ),
+    Column("effort", "Effort", "Mean square of the control, as a share of its limit.", True),
+    Column("env_steps", "Steps", "Environment steps taken in training, as stated by the authors.", True),
+    Column("seconds", "Training", "Time taken by training, as stated by the authors.", True),
     Column(
         "robustness",
         "Robust",
-        "Lowest score over environments with changed masses, drag and the like, on newer boards also with "
-        "noise, delays and pushes.",
+        "Lowest score in changed environments: with other masses, drag and the like, and on newer boards "
+        "also with noise, delays and pushes.",
     ),
-    Column("often", "10 × rate", "Score when acting ten times as often."),
+    Column("often", "10 × rate", "Score when the agent acts ten times as often."),
 )
 
 
@@ -169,8 +189,10 @@ def render(
         loader=PackageLoader("lag_envs.leaderboard.site"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    filters = {"number": rounded_text, "steps": count_text, "duration": duration, "percent": percent}
-    templates.filters |= filters | {"about": _about}
+    templates.filters |= {
+        "number": rounded_text, "steps": count_text, "duration": duration, "seconds": seconds,
+        "percent": percent, "condition": condition, "about": _about, "place": place_of,
+    }  # fmt: skip
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
         "made": data["made"], "style": style,
@@ -232,6 +254,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "state_names": [],
         "state_units": [],
         "pairs": [],
+        "controls": [],
         "dt": None,
         "title": given["id"],
         "about": [],
@@ -241,6 +264,12 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     }
     board |= {"protocol": protocol} | given | scenery_data(given["id"])
     board["rows"] = [_row(dict(row)) for row in given["rows"]]
+    known = board["known"] or {}
+    returns = [known.get("random"), known.get("best"), *(row["return"] for row in board["rows"])]
+    largest = max((abs(x) for x in returns if isinstance(x, int | float)), default=0.0)
+    #: Digits of all returns, so that they line up.
+    board["digits"] = 1 if largest >= 100.0 else 2 if largest >= 10.0 else 3
+    board["goals"] = _goals(board["goal"])
     board["page"] = _slug(str(given["id"]))
     if board["protocol"] != protocol:
         board["page"] += f"-protocol-{re.sub('[^0-9]+', '-', str(board['protocol']))}"
@@ -256,6 +285,24 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     board["poster"] = scenery.still(states, target) if states else None
     board |= {"states": states, "goal_of_states": target}
     return board
+
+
+def _goals(goal: str | None) -> dict[str, str]:
+    """Return what success and time mean, by column; what the column's own text says is left out.
+
+    Examples
+    --------
+    >>> _goals("success: across the line; time: until then")
+    {'success': 'across the line', 'settle': 'until then'}
+    >>> _goals("success: upright; time: until it is so for good"), _goals("success: up; there is no time")
+    ({'success': 'upright'}, {'success': 'up'})
+    """
+    if not goal:
+        return {}
+    joined = goal.removeprefix("success: ").replace(", and time: ", "; time: ")
+    success, _, time = joined.partition("; time: ")
+    time = time.removeprefix("until it is so for good").removeprefix(", ")
+    return {"success": success.removesuffix("; there is no time")} | ({"settle": time} if time else {})
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
@@ -322,17 +369,16 @@ def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
 
 
 def rounded_text(value: Any, digits: int = 3) -> str:
-    """Return a number with this many digits after the point, fewer for large numbers.
+    """Return a number with this many digits after the point.
 
     Examples
     --------
-    >>> [rounded_text(x) for x in (0.98765, -421.0, -1.7386, -1e-9, None)]
-    ['0.988', '−421.0', '−1.739', '0.000', '–']
+    >>> [rounded_text(x) for x in (0.98765, -1.7386, -1e-9, None)], rounded_text(-421.0, 1)
+    (['0.988', '−1.739', '0.000', '–'], '−421.0')
     """
     if not isinstance(value, int | float) or isinstance(value, bool):
         return "–"
-    size = abs(value)
-    text = f"{value:.{digits if size < 10 else max(1, digits - 1) if size < 100 else 1}f}"
+    text = f"{value:.{digits}f}"
     return text.replace("-", "−") if float(text) else text.replace("-", "")
 
 
@@ -342,11 +388,11 @@ def percent(value: Any) -> str:
     Examples
     --------
     >>> percent(0.98765), percent(1.0), percent(None)
-    ('98.8\xa0%', '100\xa0%', '–')
+    ('98.8\xa0%', '100.0\xa0%', '–')
     """
     if not isinstance(value, int | float):
         return "–"
-    return f"{100.0 * value:.1f}".removesuffix(".0") + "\N{NO-BREAK SPACE}%"
+    return f"{100.0 * value:.1f}\N{NO-BREAK SPACE}%"
 
 
 def count_text(value: Any) -> str:
@@ -354,15 +400,20 @@ def count_text(value: Any) -> str:
 
     Examples
     --------
-    >>> count_text(500_000), count_text(1_250_000), count_text(None)
-    ('500\xa0k', '1.25\xa0M', '–')
+    >>> count_text(500_000), count_text(1_250_000), count_text(2e6), count_text(7), count_text(None)
+    ('500\xa0k', '1.25\xa0M', '2.00\xa0M', '7', '–')
     """
     if not isinstance(value, int | float):
         return "–"
     for size, sign in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.3g}\N{NO-BREAK SPACE}{sign}"
+        if value >= 0.9995 * size:
+            return f"{_three(value / size)}\N{NO-BREAK SPACE}{sign}"
     return f"{value:.0f}"
+
+
+def _three(value: float) -> str:
+    """Return a positive number with three digits, or all before the point."""
+    return f"{value:#.3g}".removesuffix(".") if value < 999.5 else f"{value:.0f}"
 
 
 def duration(value: Any) -> str:
@@ -371,14 +422,52 @@ def duration(value: Any) -> str:
     Examples
     --------
     >>> duration(1.25), duration(95), duration(9000), duration(None)
-    ('1.25\xa0s', '1.58\xa0min', '2.5\xa0h', '–')
+    ('1.25\xa0s', '1.58\xa0min', '2.50\xa0h', '–')
     """
     if not isinstance(value, int | float):
         return "–"
     for size, sign in ((3600.0, "h"), (60.0, "min")):
         if value >= size:
-            return f"{value / size:.3g}\N{NO-BREAK SPACE}{sign}"
-    return f"{value:.3g}\N{NO-BREAK SPACE}s"
+            return f"{_three(value / size)}\N{NO-BREAK SPACE}{sign}"
+    return f"{_three(value)}\N{NO-BREAK SPACE}s"
+
+
+def seconds(value: Any) -> str:
+    r"""Return a time within an episode as text.
+
+    Examples
+    --------
+    >>> seconds(0.5), seconds(None)
+    ('0.50\xa0s', '–')
+    """
+    return f"{value:.2f}\N{NO-BREAK SPACE}s" if isinstance(value, int | float) else "–"
+
+
+def condition(name: str) -> str:
+    """Return a condition of robustness in words.
+
+    Examples
+    --------
+    >>> condition("mass_1 -20 %"), condition("com_distance +20 %"), condition("noise")
+    ('mass 1, −20 %', 'centre-of-mass distance, +20 %', 'sensor noise')
+    """
+    words = re.sub(r" (?=[+-]\d)", ", ", CONDITIONS.get(name, name)).replace(" -", " −")
+    return re.sub("^com_", "centre-of-mass ", words).replace("_", " ")
+
+
+def place_of(module: str | None) -> str | None:
+    """Return the path of a module of the package in the project; None if it has none.
+
+    Examples
+    --------
+    >>> place_of("lag_envs.controllers.basic"), place_of("lag_envs.controllers"), place_of("lag_envs.gone")
+    ('src/lag_envs/controllers/basic.py', 'src/lag_envs/controllers/__init__.py', None)
+    """
+    if not re.fullmatch(r"lag_envs(\.\w+)+", module or ""):
+        return None
+    path = str(module).replace(".", "/")
+    files = (f"{path}.py", f"{path}/__init__.py")
+    return next((f"src/{file}" for file in files if (PACKAGE.parent / file).is_file()), None)
 
 
 # --- data and files ---------------------------------------------------------------------------------------

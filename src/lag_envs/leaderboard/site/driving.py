@@ -120,7 +120,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
 
     Only parameters for which the changed script steps like an environment made with the changed value: Python
     code beyond the formulas' arithmetic does not reach the script. The effect on the picture is given at
-    `MARKS`.
+    `MARKS`. The limit of the controls is a factor, `shown` in units of the only control or in per cent.
     """
     task, program = env.task, env.program
     names, units = list(program.given), dict(zip(parameter_names(task.scene), _units(task), strict=True))
@@ -141,7 +141,12 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
             found.append(at | ({"looks": looks} if looks[0] != looks[-1] else {}))
     acting = task.formulas.acting
     if task.formulas.clipped and acting and all(a.low == -a.high for a in acting):
-        found.append({"name": "control limit", "unit": "", "at": names.index("strength"), "value": 1.0})
+        limit = {"name": "control limit", "at": names.index("strength"), "value": 1.0}
+        if len(acting) == 1:
+            place = task.scene.control_names.index(acting[0].control)
+            found.append(limit | {"shown": acting[0].high, "unit": task.scene.control_units[place]})
+        else:
+            found.append(limit | {"shown": 100.0, "unit": "%"})
     return found
 
 

@@ -43,8 +43,9 @@ def scenery_data(env_id: str) -> dict[str, Any]:
     dict
         ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``open`` (None, or ``knows``,
         ``share`` and ``tried``: method, budget, return), ``state_names``, ``state_units``, ``pairs`` (the
-        entries that are a coordinate and its rate), ``dt`` [s] and ``picture`` (None if the scene has no
-        bodies). Empty for an id that this version does not have, such as a frozen board's.
+        entries that are a coordinate and its rate), ``controls`` (those that actions set), ``dt`` [s] and
+        ``picture`` (None if the scene has no bodies). Empty for an id that this version does not have, such
+        as a frozen board's.
 
     Examples
     --------
@@ -61,7 +62,7 @@ def scenery_data(env_id: str) -> dict[str, Any]:
     return {
         "title": title,
         "about": [
-            " ".join(paragraph.replace("`", "").split())
+            _plain(paragraph)
             for paragraph in (description[1] if description else "").split("\n\n")
             if paragraph.strip()
         ],
@@ -70,9 +71,22 @@ def scenery_data(env_id: str) -> dict[str, Any]:
         "state_names": list(task.scene.state_names),
         "state_units": list(task.scene.state_units),
         "pairs": _pairs(task.scene),
+        "controls": [acting.control for acting in task.formulas.acting],
         "dt": task.dt,
         "picture": picture_data(Picture(task)),
     }
+
+
+def _plain(paragraph: str) -> str:
+    r"""Return a docstring's paragraph without its markup.
+
+    Examples
+    --------
+    >>> _plain("only its *observation*, see [1]_"), _plain(".. [1] A. Author,\n   `x`")
+    ('only its observation, see [1]', '[1] A. Author, x')
+    """
+    words = " ".join(paragraph.replace("`", "").split())
+    return re.sub(r"\*(\w+)\*", r"\1", re.sub(r"^\.\. (?=\[)", "", words).replace("]_", "]"))
 
 
 def _open(task: Task) -> dict[str, Any] | None:

@@ -133,6 +133,9 @@
     return view.getFloat64(0);
   }
 
+  /** All digits of a number, and the sign of a zero. */
+  const exact = (x) => (Object.is(x, -0) ? "−0" : String(x).replace(/-/g, "−"));
+
   function crc32(text) {
     let crc = -1;
     for (const byte of new TextEncoder().encode(text)) {
@@ -196,16 +199,17 @@
   /** The contents of a link; throws an error with a text for the reader. */
   function readLink(link, about) {
     const fields = link.slice(link.lastIndexOf(MARK) + MARK.length).trim().split("~");
-    if (!link.includes(MARK) || fields.length < 2) throw new Error("This is not the link of a drive.");
+    if (!link.includes(MARK) || fields.length < 2) throw new Error("This is not a link to a drive.");
     if (fields[0] !== String(about.version)) throw new Error("The link's version is not one that this page reads.");
     const [, id, seed, packed, claimed, digest, check] = fields;
     if (fields.length !== 7 || check !== crc32(fields.slice(0, 6).join("~"))) {
-      throw new Error("The link is damaged; copy it once more, whole.");
+      throw new Error("The link is damaged; copy all of it again.");
     }
-    if (id !== about.id) throw new Error(`The link is of another environment, ${id.slice(0, 60)}.`);
+    if (id !== about.id) throw new Error(`The link belongs to another environment, ${id.slice(0, 60)}.`);
     if (!/^(0|[1-9]\d{0,19})$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed) || packed.length % 4 === 1) {
       throw new Error("The link is forged: a field is not what it must be.");
     }
+    if (!Number.isFinite(doubleOf(claimed))) throw new Error("The link is forged: the return that it claims is not a finite number.");
     if (digest !== about.digest) throw new Error("The drive was made with another version of this environment.");
     if (!packed) throw new Error("The link's drive has no step.");
     return { seed: big(seed), keys: unpack(packed, about), claimed };
@@ -556,6 +560,11 @@
     let [past, now] = [me.poses(), me.poses()];
     let picture = board.picture;
     const untouched = () => constants === code.constants;
+    const finished = (episode) => episode.over === "terminated" || episode.over === "truncated";
+    const ended = () => Boolean(me.over || (rerunning && !rerunning.keys[me.steps]));
+
+    /** A return, and its score if the episode is whole: where rewards are costs, a part of it looks too good. */
+    const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode.total))}` : ""}`;
 
     const tell = (words) => {
       message.textContent = words;
@@ -696,7 +705,7 @@
     function tick() {
       const key = rerunning ? rerunning.keys[me.steps] : hands.numbers();
       if (!key) {
-        finish("The link's keys end here.");
+        finish("The link's keys end here");
         return;
       }
       past = now;
@@ -710,10 +719,10 @@
     function finish(words = "") {
       running = false;
       label();
-      const ending = words || { terminated: "The episode has ended.", truncated: "Time is up.", refused: "The step was refused: it cannot be taken to full accuracy." }[me.over];
-      const result = known && untouched() ? `Score ${text(scoreOf(me.total))}` : `Return ${text(me.total, 2)}, not scored`;
-      const beside = ghost && ghostAt(1) ? `; ${ghost.name}: ${known ? text(scoreOf(ghostAt(1).total)) : text(ghostAt(1).total, 2)}` : "";
-      tell(`${ending} ${result}${beside}. R: again, N: another start.`);
+      const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
+      const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
+      const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
+      tell(`${ending}: ${result}${beside}. R: ${rerunning ? "drive from this start" : "again"}, N: another start.`);
       offer();
     }
 
@@ -741,20 +750,32 @@
     }
 
     function label() {
-      go.textContent = running ? "Pause" : me.steps && !me.over ? "Resume" : "Start";
+      go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
     }
 
     function run() {
       if (running) return;
-      if (me.over || (rerunning && !rerunning.keys[me.steps])) restart();
       running = true;
       note();
-      message.textContent = "";
-      said.textContent = "Driving";
+      message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive." : "";
+      said.textContent = message.textContent || "Driving";
       share.hidden = true;
       before = performance.now();
       label();
       requestAnimationFrame(frame);
+    }
+
+    /** Pause or go on. What has ended starts again, with the player at the controls. */
+    function toggle() {
+      if (running) {
+        pause();
+        return;
+      }
+      if (ended()) {
+        rerunning = null;
+        restart();
+      }
+      run();
     }
 
     function pause() {
@@ -790,19 +811,28 @@
       readOut(ghostAt(part));
     }
 
+    /** The control that a step's number asks for, within the limit that a slider may have changed. */
+    function controlOf(n, { values, low, high }) {
+      if (values.length) return values[n];
+      const limit = about.sliders.find(({ shown }) => shown);
+      const share = (n / about.levels) * (limit ? constants[limit.at] : 1);
+      return low === -high ? high * share : low + (high - low) * (0.5 + 0.5 * share);
+    }
+
     const cells = new Map();
 
     function readOut(beside) {
-      const score = (total) => (known ? text(scoreOf(total)) : "–");
+      const score = known && (finished(me) ? text(scoreOf(me.total)) : !ended() && "at the end") || "–";
       const keys = rerunning ? rerunning.keys[Math.max(0, me.steps - 1)] ?? [] : mine[mine.length - 1] ?? [];
       const entries = [
         ["Time", `${text(me.steps * about.dt, 2)} s`],
-        ["Score so far", untouched() ? score(me.total) : "not scored"],
         ["Return", text(me.total, 2)],
-        ...(ghost ? [["Ghost", beside ? score(beside.total) : "–"]] : []),
-        ...about.controls.map(({ name, values, unit }, i) => {
-          const n = keys[i];
-          return [symbol(name), n === undefined ? "–" : values.length ? `${text(values[n], 2)} ${unit}` : text(n / about.levels, 2)];
+        ...(ghost ? [["Ghost's return", beside ? text(beside.total, 2) : "–"]] : []),
+        ["Score", untouched() ? score : "not scored"],
+        ...about.controls.map((control, i) => {
+          const { name, unit, low, high } = control;
+          const digits = Math.max(-low, high) < 1 ? 3 : 2;
+          return [symbol(name), keys[i] === undefined ? "–" : `${text(controlOf(keys[i], control), digits)} ${unit}`.trim()];
         }),
         ...board.state_names.map((name, i) => [symbol(name), `${text(me.f[i], 2)} ${board.state_units[i] ?? ""}`]),
       ];
@@ -833,10 +863,10 @@
     const inputs = about.sliders.map((slider) => {
       const input = make("input", { type: "range", min: "-1", max: "1", step: "0.01", value: "0" });
       const output = make("output");
-      const name = slider.name.replace(/_/g, " ");
+      const name = slider.name.replace(/^com_/, "centre-of-mass ").replace(/_/g, " ");
       const say = () => {
         const value = slider.value * 2 ** Number(input.value);
-        output.textContent = `${+value.toPrecision(3)} ${slider.unit}`;
+        output.textContent = `${+(value * (slider.shown ?? 1)).toPrecision(3)} ${slider.unit}`;
         input.setAttribute("aria-valuetext", output.textContent);
         return value;
       };
@@ -846,7 +876,7 @@
         picture = look();
         rerunning = null;
         restart();
-        tell(untouched() ? "As it was: scored again." : "The machine was changed: this drive is not scored.");
+        tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
       });
       panel.append(make("label", {}, make("span", {}, name), input, output));
       return { slider, input, say };
@@ -861,13 +891,13 @@
       inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
       code.functions.derive(constants);
     }
-    const reset = button("reset", "As it was");
+    const reset = button("reset", "Reset");
     reset.addEventListener("click", () => {
       for (const { input } of inputs) input.value = "0";
       change();
       picture = look();
       restart();
-      tell("As it was: scored again.");
+      tell("The machine is as it was: drives are scored again.");
     });
     panel.append(reset);
     panel.hidden = !inputs.length;
@@ -904,17 +934,17 @@
           requestAnimationFrame(go);
           return;
         }
-        const whole = episode.steps === told.keys.length && episode.over !== "refused";
-        const fair = whole && hexOf(episode.total) === told.claimed;
-        verdict.dataset.true = String(fair);
-        const claim = doubleOf(told.claimed);
-        const words = known ? `score ${text(scoreOf(episode.total))}` : `return ${text(episode.total, 2)}`;
-        const ending = episode.over ? "" : ", stopped before its end";
+        const fair = hexOf(episode.total) === told.claimed;
+        const forged = episode.over === "refused" ? `step ${episode.steps + 1} cannot be taken`
+          : episode.steps < told.keys.length ? `its episode ends after ${episode.steps} steps, but it has keys for ${told.keys.length}` : "";
+        verdict.dataset.true = String(fair && !forged);
+        if (forged) {
+          verdict.textContent = `The link is forged: ${forged}.`;
+          return;
+        }
         verdict.textContent = fair
-          ? `The link is true, recomputed to the last bit: ${words}${ending}.`
-          : `The link is false: it claims a return of ${text(claim, 4)}${known ? `, score ${text(scoreOf(claim))}` : ""}; ` +
-            (whole ? `its keys give ${text(episode.total, 4)}.` : "its episode ends before its keys do.");
-        if (!whole) return;
+          ? `The link is true, recomputed to the last bit: ${resultOf(episode)}${episode.over ? "" : "; it stops before the episode's end, so it has no score"}.`
+          : `The link is false: it claims a return of ${exact(doubleOf(told.claimed))}, but its keys give ${exact(episode.total)}.`;
         if (!untouched()) reset.click();
         linked = told;
         seed = told.seed;
@@ -939,6 +969,7 @@
       }
       verdict.textContent = "";
       if (hash.includes(MARK)) {
+        stage.focus();
         checkLink(hash);
         return;
       }
@@ -949,6 +980,7 @@
         verdict.dataset.true = "false";
         return;
       }
+      stage.focus();
       seed = big(match[1]);
       rerunning = null;
       restart();
@@ -964,9 +996,9 @@
       const drives = hands.pairs.flat().includes(key) || (/^[1-9]$/.test(key) && about.controls.some((c) => c.values.length));
       if (drives) {
         hands.pressed.add(key);
-        if (!running && !me.over) run();
-      } else if (key === " ") running ? pause() : run();
-      else if (key === "r") restart(), run();
+        if (!running && !ended()) run();
+      } else if (key === " ") toggle();
+      else if (key === "r") afresh();
       else if (key === "n") another();
       else return;
       event.preventDefault();
@@ -974,16 +1006,20 @@
     stage.addEventListener("keyup", (event) => hands.pressed.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key));
     stage.addEventListener("blur", () => hands.release());
 
-    function another() {
+    function afresh() {
       rerunning = null;
+      restart();
+      run();
+    }
+
+    function another() {
       if (ghost?.replays || ghost?.seed !== undefined) {
         ghostSelect.value = "";
         ghost = null;
         episodeLabel.hidden = true;
       }
       seed = big(Math.floor(Math.random() * 2 ** 32));
-      restart();
-      run();
+      afresh();
     }
 
     function point(event) {
@@ -997,8 +1033,8 @@
       if (event.button) return;
       canvas.setPointerCapture?.(event.pointerId);
       stage.focus({ preventScroll: true });
+      if (!running) toggle();
       point(event);
-      if (!running) run();
       event.preventDefault();
     });
     canvas.addEventListener("pointermove", (event) => hands.pointer && point(event));
@@ -1013,24 +1049,12 @@
     window.addEventListener("gamepaddisconnected", () => hands.readPad());
     document.addEventListener("visibilitychange", () => document.hidden && running && pause());
 
-    go.addEventListener("click", () => {
-      if (running) pause();
-      else {
-        rerunning = me.steps && !me.over ? rerunning : null;
-        run();
-        stage.focus({ preventScroll: true });
-      }
-    });
-    again.addEventListener("click", () => {
-      rerunning = null;
-      restart();
-      run();
-      stage.focus({ preventScroll: true });
-    });
-    fresh.addEventListener("click", () => {
-      another();
-      stage.focus({ preventScroll: true });
-    });
+    for (const [pressed, act] of [[go, toggle], [again, afresh], [fresh, another]]) {
+      pressed.addEventListener("click", () => {
+        act();
+        if (running) stage.focus({ preventScroll: true });
+      });
+    }
     watch.addEventListener("click", () => {
       running = false;
       ghostSelect.value = "";
@@ -1040,6 +1064,7 @@
       rerunning = linked;
       restart();
       run();
+      stage.focus({ preventScroll: true });
     });
     speed.addEventListener("change", () => (before = performance.now()));
     ghostSelect.addEventListener("change", () => {

@@ -70,12 +70,12 @@
   const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
   const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
 
-  /** "theta_dot", "theta_1_dot" or "psi''" as on paper. */
+  /** "theta_dot", "theta_1_dot" or "psi''" as on paper, "elbow_torque" as words. */
   function symbol(name) {
     const [, base, index = "", rate = ""] = name.match(/^(.+?)(?:_(\d+))?(_d+ot|'+)?$/) ?? ["", name];
     const dots = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
     const lower = index.replace(/\d/g, (digit) => String.fromCharCode(0x2080 + Number(digit)));
-    return (GREEK[base] ?? base) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
+    return (GREEK[base] ?? base.replace(/_/g, " ")) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
   }
 
   // --- scenes ----------------------------------------------------------------------------------------------
@@ -502,7 +502,7 @@
       saying = setTimeout(() => {
         const parts = sides.filter((side) => side.replay).map((side) => {
           const now = momentOf(side);
-          const states = board.state_names.map((n, i) => `${n.replace("_", " ")} ${text(now.state[i], 2)}`);
+          const states = board.state_names.map((n, i) => `${n.replace(/_/g, " ")} ${text(now.state[i], 2)}`);
           const words = `${"AB"[side.index]}, ${board.rows[side.row].name}, at ${text(now.time, 2)} seconds: ` +
             `action ${[now.action].flat().map((v) => text(v, 2)).join(", ")}, reward ${text(now.reward, 2)}, return ${text(now.total, 1)}, ` +
             states.join(", ");
@@ -655,28 +655,44 @@
 
   const lanes = (width) => ({ left: width < 500 ? 8 : 64, right: 8 });
 
-  /** Action and reward over time, of both sides, with the present as a line. */
+  /** What is drawn over time: a name, and the values of an episode; each number of an action on its own. */
+  function tracesOf(sides) {
+    const many = Math.max(1, ...sides.map(({ replay }) => (replay ? [replay.actions[0]].flat().length : 1)));
+    const actions = Array.from({ length: many }, (_, k) => ({
+      name: many > 1 && board.controls[k] ? symbol(board.controls[k]) : "Action",
+      valuesOf: ({ actions }) => actions.map((action) => [action].flat()[k]),
+    }));
+    return [...actions, { name: "Reward", valuesOf: ({ rewards }) => rewards }];
+  }
+
+  /** Actions and reward over time, of both sides, with the present as a line. */
   function drawTraces(canvas, sides, time, end) {
+    const shown = tracesOf(sides);
+    canvas.style.height = `${4.75 * shown.length}rem`;
     const { pen, width, height } = fit(canvas);
     pen.clearRect(0, 0, width, height);
     if (!width || !end) return;
     const { left, right } = lanes(width);
     const x = (t) => left + ((width - left - right) * t) / end;
-    const gap = 14;
-    const lane = (height - gap) / 2;
+    // A name stands beside its lines, or above them where there is no room.
+    const beside = left > 20;
+    const gap = beside ? 14 : 24;
+    const lane = (height - gap * (shown.length - beside)) / shown.length;
     pen.font = `12px ${getComputedStyle(canvas).fontFamily}`;
-    ["actions", "rewards"].forEach((what, i) => {
-      const values = sides.flatMap((side) => (side.replay ? side.replay[what].flat() : [])).filter(isNumber);
-      let [low, high] = what === "actions" ? [-1, 1] : [0, 0];
+    shown.forEach(({ name, valuesOf }, i) => {
+      const lines = sides.map((side) => (side.replay ? valuesOf(side.replay) : []));
+      const values = lines.flat().filter(isNumber);
+      const isReward = name === "Reward";
+      let [low, high] = isReward ? [0, 0] : [-1, 1];
       for (const v of values) [low, high] = [Math.min(low, v), Math.max(high, v)];
       // One large last reward, such as a penalty, must not flatten all others.
-      if (what === "rewards" && values.length > 20) {
+      if (isReward && values.length > 20) {
         const sorted = [...values].sort((a, b) => a - b);
         const [a, b] = [sorted[Math.floor(0.01 * values.length)], sorted[Math.ceil(0.99 * values.length) - 1]];
         [low, high] = [Math.max(low, Math.min(0, a - (b - a))), Math.min(high, Math.max(0, b + (b - a)))];
       }
       if (!(high > low)) high = low + 1;
-      const top = i * (lane + gap);
+      const top = i * (lane + gap) + (beside ? 0 : gap);
       const y = (v) => top + 2 + (lane - 4) * (1 - (clamp(v, low, high) - low) / (high - low));
       pen.strokeStyle = ink.line;
       pen.lineWidth = 1;
@@ -684,34 +700,27 @@
         trace(pen, [[left, y(v)], [width - right, y(v)]], false);
         pen.stroke();
       }
-      if (left > 20) {
-        pen.fillStyle = ink.soft;
-        pen.textBaseline = "middle";
-        pen.textAlign = "left";
-        pen.fillText(what === "actions" ? "Action" : "Reward", 0, top + lane / 2);
-      }
       pen.save();
       pen.beginPath();
       pen.rect(left, top - 2, width - left - right, lane + 4);
       pen.clip();
       for (const side of sides) {
         if (!side.replay) continue;
-        const rows = side.replay[what].map((v) => [v].flat());
         pen.strokeStyle = ink.series[side.row % COLOURS];
         pen.lineWidth = 1.4;
         pen.setLineDash(side.index ? [4, 2] : []);
-        // A line for each number of an action.
-        (rows[0] ?? []).forEach((_, k) => {
-          const points = [];
-          rows.forEach((row, j) => {
-            const v = row[k];
-            if (isNumber(v)) points.push([x(j * side.replay.dt), y(v)], [x((j + 1) * side.replay.dt), y(v)]);
-          });
-          trace(pen, points, false);
-          pen.stroke();
+        const points = [];
+        lines[side.index].forEach((v, j) => {
+          if (isNumber(v)) points.push([x(j * side.replay.dt), y(v)], [x((j + 1) * side.replay.dt), y(v)]);
         });
+        trace(pen, points, false);
+        pen.stroke();
       }
       pen.restore();
+      pen.fillStyle = ink.soft;
+      pen.textBaseline = "middle";
+      pen.textAlign = "left";
+      pen.fillText(name, beside ? 0 : left, beside ? top + lane / 2 : top - 10);
     });
     pen.strokeStyle = ink.ink;
     pen.lineWidth = 1.5;
@@ -1087,7 +1096,7 @@
       y: "share above τ",
       spanX: taus.length ? [Math.max(-0.5, Math.min(...taus)), Math.min(1.2, Math.max(...taus))] : [0, 1],
       spanY: [0, 1],
-      tell: (line) => `half of them above ${text(line.find((p) => p[1] <= 0.5)?.[0], 2)}`,
+      tell: (line) => `half of its episodes above ${text(line.find((p) => p[1] <= 0.5)?.[0], 2)}`,
     });
     const curves = board.rows.map((row, i) => {
       const seeds = row.curves.map(({ steps, scores }) => steps.map((x, j) => [x, scores[j]]));
