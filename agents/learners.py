@@ -476,5 +476,7 @@ def load_policy(folder: Path) -> Any:
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
-        raise UserError(f"the policy in {folder} cannot be read ({reason}); train it again") from error
+        raise UserError(
+            f"the policy in {folder} cannot be read ({reason}); train it again, with --new"
+        ) from error
     return LearnedPolicy(model, normalise, numbered(result["hyperparameters"]))
