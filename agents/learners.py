@@ -119,7 +119,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
 def suits(algo: str, task: Task) -> bool:
     """Return whether a learner supports a task's kind of actions: discrete or continuous."""
     choices = bool(task.formulas.choices)
-    return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
+    return choices if algo == "dqn" else not (choices and algo in (*OFF_POLICY, "shac", "cloning"))
 
 
 class LearnerSettings(Strict):

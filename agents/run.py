@@ -252,8 +252,26 @@ def check_numbers(args: argparse.Namespace, **least: int) -> None:
             raise UserError(f"{option} must lie between {smallest} and 2147483647, got {value}")
 
 
+def check_writable(file: Path) -> None:
+    """Raise a UserError for a file that cannot be written or grow, before hours of work on its content."""
+    new = not file.exists()
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("ab", buffering=0) as out:
+            size = out.tell()
+            fits = out.write(bytes(4096)) == 4096
+            out.truncate(size)
+    except OSError as error:
+        raise UserError(f"{file} cannot be written: {error.strerror}") from error
+    finally:
+        if new:
+            file.unlink(missing_ok=True)
+    if not fits:
+        raise UserError(f"{file} cannot be written: no space left")
+
+
 def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Make a command's function print a user's mistake or the system's refusal in a line, and return 2.
+    """Make a command's function print a user's mistake in a line and return 2, or the system's refusal and 1.
 
     Interrupted, it returns 130; where nobody reads on, such as `head`, 0.
     """
@@ -269,7 +287,7 @@ def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[...,
                 return 0
             except (UserError, OSError) as error:
                 print(f"{program}: error: {error}", file=sys.stderr)
-                return 2
+                return 2 if isinstance(error, UserError) else 1
             except KeyboardInterrupt:
                 print("\nInterrupted.", file=sys.stderr)
                 return 130

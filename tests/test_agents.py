@@ -180,7 +180,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path, monkeypatch):
 
     monkeypatch.setattr(demo, "record_video", full)
     status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
-    assert status == 2 and "agents.demo: error: [Errno 28] No space left on device: 'episode.mp4'" in output
+    assert status == 1 and "agents.demo: error: " in output and "episode.mp4" in output
     assert "switching line" in output and (folder / "comparison.json").exists()
     (folder / "model.zip").unlink()
     status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
