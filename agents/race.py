@@ -51,11 +51,10 @@ of training counts nothing else; tests on {EPISODES} episodes stop it, {TESTS} t
 whole process: imports, compiling, training, and one evaluation. Times on the processor do not count what
 others do on it.
 
-On a terminal a table shows each training while it runs. One that fails is named, and tried again when the
-command is run again; the others count.
+On a terminal a table shows each training while it runs. One that fails is named, and does not count.
 
 A level's time is that of the first test that reaches it; a training that never does counts as never. No
-training is started again, and tests decide nothing.
+training that ended is started again, and tests decide nothing.
 
 examples:
   python -m agents.race                                            our PPO and Stable-Baselines3's, five seeds

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import errno
 import json
 import re
 import sys
@@ -98,10 +97,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for problem in broken:
             print(f"left out: {problem}", file=sys.stderr)
         return 1 if broken else 0
-    except OSError as error:
-        full = " (no space left)" if error.errno == errno.ENOSPC else ""
-        print(f"agents.results: error: {error}{full}; what was measured before is kept", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("\nStopped. What was measured is kept; re-run the command to resume.", file=sys.stderr)
         return 130
