@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import shutil
 import sys
@@ -176,7 +177,9 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     time_axis.set_xlabel("seconds of training")
     axes.grid(alpha=0.3)
     axes.legend(loc="best")
-    figure.savefig(run.folder / "learning_curve.png", dpi=120)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=120)
+    write_file(run.path("learning_curve.png"), drawn.getvalue())
 
 
 def record_video(policy: Any, run: Run, seed: int) -> None:

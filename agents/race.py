@@ -31,7 +31,6 @@ from agents.run import (
     check_writable,
     known_name,
     reports_errors,
-    terminable,
 )
 from lag_envs import TASKS, store, workers
 from lag_envs.evaluation.statistics import median_time
@@ -110,13 +109,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     files = [file for file in (args.output, args.picture) if file]
     if len({file.resolve() for file in files}) < len(files):
         raise UserError(f"--output and --picture are both {args.picture}; give each its own file")
-    before = earlier_rows(args.output) if args.output else []
     for file in files:
         check_writable(file)
+    before = earlier_rows(args.output) if args.output else []
     print("  ".join(f"{name}: {value}" for name, value in machine().items()), flush=True)
     rows: list[dict[str, Any]] = []
     try:
-        with terminable(), live_view() as show:
+        with live_view() as show:
             for settings in trainings(args, names):
                 row = next((row for row in before if settings.items() <= row.items()), None)
                 if row is None:

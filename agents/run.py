@@ -9,14 +9,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import pickle
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
 from hashlib import sha256
@@ -25,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs import TASKS
-from lag_envs.errors import UserError, hint
+from lag_envs.errors import UserError, hint, run_shown
 from lag_envs.store import write_file
 
 SCHEMA = 1
@@ -255,6 +250,8 @@ def check_numbers(args: argparse.Namespace, **least: int) -> None:
 def check_writable(file: Path) -> None:
     """Raise a UserError for a file that cannot be written or grow, before hours of work on its content."""
     new = not file.exists()
+    if not new and not file.is_file():
+        raise UserError(f"{file} is no regular file: it cannot be kept for the next time")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("ab", buffering=0) as out:
@@ -271,44 +268,13 @@ def check_writable(file: Path) -> None:
 
 
 def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Make a command's function print a user's mistake in a line and return 2, or the system's refusal and 1.
-
-    Interrupted, it returns 130; where nobody reads on, such as `head`, 0.
-    """
+    """Let a command's function show its errors in a line and obey SIGTERM, see `run_shown`."""
 
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)
         def run(arguments: Sequence[str] | None = None) -> int:
-            try:
-                return main(arguments)
-            except BrokenPipeError:
-                # Nothing more must be written, not even at exit.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                return 0
-            except (UserError, OSError) as error:
-                print(f"{program}: error: {error}", file=sys.stderr)
-                return 2 if isinstance(error, UserError) else 1
-            except KeyboardInterrupt:
-                print("\nInterrupted.", file=sys.stderr)
-                return 130
+            return run_shown(program, lambda: main(arguments))
 
         return run
 
     return decorated
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -36,7 +36,6 @@ from agents.run import (
     known_name,
     own_env,
     reports_errors,
-    terminable,
 )
 from lag_envs import TASKS, workers
 from lag_envs.options import module_parser
@@ -309,7 +308,7 @@ def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str
         dynamic_ncols=True, initial=sum(steps.values()),
     )  # fmt: skip
     try:
-        with terminable(), parallel_map(runs) as poll, bar:
+        with parallel_map(runs) as poll, bar:
             while left:
                 event = poll()
                 if event is None:

@@ -19,7 +19,7 @@ from scipy.optimize import differential_evolution
 from agents import learners
 from agents.learners import load_policy, zoo_hyperparameters
 from agents.results import ROOT, results_json
-from agents.run import Run, UserError, check_env, check_numbers, check_writable, reports_errors, terminable
+from agents.run import Run, UserError, check_env, check_numbers, check_writable, reports_errors
 from lag_envs import workers
 from lag_envs.controllers import build
 from lag_envs.errors import hint
@@ -229,9 +229,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         file = args.output or RESULTS / f"{args.env}.json"
         check_writable(file)
         try:
-            with terminable():
-                numbers = args.settings, args.seeds or 2, steps, args.episodes or 200, args.jobs or 1
-                data, failed = search_settings(args.env, *numbers, file)
+            counts = args.settings, args.seeds or 2, steps, args.episodes or 200, args.jobs or 1
+            data, failed = search_settings(args.env, *counts, file)
         except KeyboardInterrupt:
             print("\nStopped. What was tried is kept; re-run the command to resume.", file=sys.stderr)
             return 130
