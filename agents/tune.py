@@ -232,7 +232,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             counts = args.settings, args.seeds or 2, steps, args.episodes or 200, args.jobs or 1
             data, failed = search_settings(args.env, *counts, file)
         except KeyboardInterrupt:
-            print("\nStopped. What was tried is kept; re-run the command to resume.", file=sys.stderr)
+            kept = " What was tried is kept; re-run the command to resume." if file.exists() else ""
+            print(f"\nStopped.{kept}", file=sys.stderr)
             return 130
         if failed:
             print(f"{failed} of the trainings failed; re-run the command to try them again", file=sys.stderr)
