@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import shutil
 import sys
@@ -19,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparameters
-from agents.run import RESULT, Run, UserError, fresh_seeds, known_name, own_env, reports_errors
+from agents.run import RESULT, Run, UserError, check_numbers, fresh_seeds, known_name, own_env, reports_errors
 from agents.train import command, here, show_progress
 from lag_envs.evaluation.rollout import play
 from lag_envs.options import module_parser
@@ -73,21 +74,19 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    try:
-        run = open_run(args)
-        print(f"{run.env}, {run.algo}, seed {run.seed}: {run.trained:,} of {run.steps:,} steps trained")
-        if run.load_result() is None:
-            print("Loading PyTorch and compiling the environment (kept for the next time) ...", flush=True)
-            failed, stopped = show_progress([run], here)
-            for reason in failed.values():
-                print(f"agents.demo: error: {reason}", file=sys.stderr)
-            if stopped or failed:
-                print(f"To resume: {command('agents.demo', arguments)}")
-                return 130 if stopped else 1
-        report(run, video=not args.no_video)
-    except KeyboardInterrupt:
-        print("\nInterrupted.", file=sys.stderr)
-        return 130
+    run = open_run(args)
+    finished = run.load_result()
+    done = "finished before" if finished else f"{run.trained:,} of {run.steps:,} steps trained"
+    print(f"{run.env}, {run.algo}, seed {run.seed}: {done}")
+    if not finished:
+        print("Loading PyTorch and compiling the environment (kept for the next time) ...", flush=True)
+        failed, stopped = show_progress([run], here)
+        for reason in failed.values():
+            print(f"agents.demo: error: {reason}", file=sys.stderr)
+        if stopped or failed:
+            print(f"To resume: {command('agents.demo', arguments)}")
+            return 130 if stopped else 1
+    report(run, video=not args.no_video)
     return 0
 
 
@@ -95,10 +94,7 @@ def open_run(args: argparse.Namespace) -> Run:
     """Return the run that the arguments ask for, or raise a UserError."""
     env = own_env(args.env)
     known_name("algorithm", args.algo, LEARNERS)
-    if not 0 <= args.seed < 2**31:
-        raise UserError(f"--seed must lie between 0 and 2147483647, got {args.seed}")
-    if args.steps is not None and args.steps < 1:
-        raise UserError(f"--steps must be at least 1, got {args.steps}")
+    check_numbers(args, seed=0, steps=1)
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
     hyper = zoo_hyperparameters(args.algo, env)
@@ -127,9 +123,6 @@ def report(run: Run, video: bool) -> None:
     agents = {learner: policy} | {name: build(task, name) for name in quick}
     returns = {name: play(run.env, agent, seeds) for name, agent in agents.items()}
     seconds = time.perf_counter() - started
-    draw_curve(run, learner, result, returns)
-    if video:
-        record_video(policy, run, seeds[0])
     comparison = {
         "env": run.env,
         "evaluation_seeds": list(seeds),
@@ -152,8 +145,12 @@ def report(run: Run, video: bool) -> None:
         print(f"The score is {ends}.")
     print(
         f"\n{result['trained']:,} steps in {result['wall_seconds']:.1f} s of training, "
-        f"{seconds:.1f} s of evaluation."
+        f"{seconds:.1f} s of evaluation.",
+        flush=True,
     )
+    draw_curve(run, learner, result, returns)
+    if video:
+        record_video(policy, run, seeds[0])
     print(f"In {run.folder}: " + ", ".join(sorted(p.name for p in run.folder.iterdir())))
 
 
@@ -180,7 +177,9 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     time_axis.set_xlabel("seconds of training")
     axes.grid(alpha=0.3)
     axes.legend(loc="best")
-    figure.savefig(run.folder / "learning_curve.png", dpi=120)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=120)
+    write_file(run.path("learning_curve.png"), drawn.getvalue())
 
 
 def record_video(policy: Any, run: Run, seed: int) -> None:

@@ -119,7 +119,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
 def suits(algo: str, task: Task) -> bool:
     """Return whether a learner supports a task's kind of actions: discrete or continuous."""
     choices = bool(task.formulas.choices)
-    return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
+    return choices if algo == "dqn" else not (choices and algo in (*OFF_POLICY, "shac", "cloning"))
 
 
 class LearnerSettings(Strict):
@@ -476,5 +476,7 @@ def load_policy(folder: Path) -> Any:
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
-        raise UserError(f"the policy in {folder} cannot be read ({reason}); train it again") from error
+        raise UserError(
+            f"the policy in {folder} cannot be read ({reason}); train it again, with --new"
+        ) from error
     return LearnedPolicy(model, normalise, numbered(result["hyperparameters"]))

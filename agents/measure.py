@@ -123,11 +123,6 @@ def learned_policy(env_id: str, folder: Path) -> Entrant:
             f"{folder / RESULT} is of {result.get('env')} {result.get('algo')} seed {result.get('seed')},"
             " which is not what its folder says; move it to the right folder"
         )
-    try:
-        float(result["wall_seconds"]), int(result["trained"]), result["hyperparameters"], result["steps"]
-        np.array(result["curve"], np.float64).reshape(-1, 3)
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{folder / RESULT} cannot be read ({error!r}); train the run again") from error
     if not (folder / MODEL).exists():
         raise UserError(f"{folder} has a result but no {MODEL}; train the run again, or remove it")
     mark = digest(folder / MODEL, folder / NORMALISATION, EXPORT)

@@ -6,20 +6,33 @@
 from __future__ import annotations
 
 import argparse
+import io
+import multiprocessing
+import queue
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from agents import learners
 from agents.analysis import LEVELS, first_reached
-from agents.learners import LEARNERS, learner_label, zoo_hyperparameters
-from agents.run import Run, UserError, check_env, known_name, reports_errors, terminable
-from lag_envs import store, workers
+from agents.learners import LEARNERS, learner_label, suits, zoo_hyperparameters
+from agents.run import (
+    Run,
+    UserError,
+    check_env,
+    check_numbers,
+    check_writable,
+    known_name,
+    reports_errors,
+)
+from lag_envs import TASKS, store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
 from lag_envs.options import module_parser, new_file, new_picture
@@ -29,20 +42,36 @@ from lag_envs.tables import aligned
 ENV = "PivotedBar-v0"
 #: Tests of a training, and episodes of each.
 TESTS, EPISODES = 24, 100
+#: Heights of a small curve's characters, for scores from 0 to 1, and how many characters it has.
+HEIGHTS, WIDTH = "▁▂▃▄▅▆▇█", 16
 EPILOG = f"""Each training runs in a process of its own on one core, one after the other: with one seed every
 learner, then with the next. So whatever else the machine does disturbs all alike. There are two clocks. That
 of training counts nothing else; tests on {EPISODES} episodes stop it, {TESTS} times. The other is that of the
 whole process: imports, compiling, training, and one evaluation. Times on the processor do not count what
 others do on it.
 
+On a terminal a table shows each training while it runs. One that fails is named, and does not count.
+
 A level's time is that of the first test that reaches it; a training that never does counts as never. No
-training is started again, and tests decide nothing.
+training that ended is started again, and tests decide nothing.
 
 examples:
   python -m agents.race                                            our PPO and Stable-Baselines3's, five seeds
   python -m agents.race --learners fast_ppo --seeds 20 --first-seed 100
   python -m agents.race PivotedBar-v0 --output race.jsonl --picture race.png
 """
+
+
+class Row(BaseModel):
+    """What a table and a picture need of a training that a file holds."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+    #: Steps, seconds, seconds on the processor and score of each test.
+    curve: list[Annotated[list[float], Field(min_length=4, max_length=4)]] = Field(min_length=1)
+    score: float
+    seconds: float
+    process_seconds: float
 
 
 def parser() -> argparse.ArgumentParser:
@@ -61,61 +90,120 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--output", type=new_file, metavar="FILE", help="keep each training as a line of JSON; resumes"
     )
-    p.add_argument("--picture", type=new_picture, metavar="FILE", help="draw scores against seconds")
+    p.add_argument("--picture", type=new_picture, metavar="FILE", help="draw scores against time and steps")
     return p
 
 
 @reports_errors("agents.race")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 for a user's mistake, 130 when interrupted."""
+    """Run the command; return 0, 1 where a training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    check_env(args.env)
+    task = TASKS[check_env(args.env)]()
     if known_returns(args.env) is None:
         raise UserError(f"{args.env} has no scale of scores yet; python -m agents.scale measures one")
     names = [known_name("learner", name, LEARNERS) for name in dict.fromkeys(args.learners)]
-    for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1)):
-        if (value := getattr(args, name)) is not None and value < least:
-            raise UserError(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
-    before = list(store.rows(args.output)) if args.output else []
+    if unfit := [name for name in names if not suits(name, task)]:
+        fit = ", ".join(name for name in LEARNERS if suits(name, task))
+        raise UserError(f"{unfit[0]} does not learn actions of {args.env}'s kind; there are {fit}")
+    check_numbers(args, seeds=1, first_seed=0, steps=1)
+    files = [file for file in (args.output, args.picture) if file]
+    if len({file.resolve() for file in files}) < len(files):
+        raise UserError(f"--output and --picture are both {args.picture}; give each its own file")
+    for file in files:
+        check_writable(file)
+    before = earlier_rows(args.output) if args.output else []
+    print("  ".join(f"{name}: {value}" for name, value in machine().items()), flush=True)
     rows: list[dict[str, Any]] = []
-    print("  ".join(f"{name}: {value}" for name, value in machine().items()))
     try:
-        with terminable():
-            for seed in range(args.first_seed, args.first_seed + args.seeds):
-                for name in names:
-                    hyper = zoo_hyperparameters(name, args.env)
-                    settings = {
-                        "env": args.env, "algo": name, "seed": seed,
-                        "steps": args.steps or int(hyper["n_timesteps"]), "hyperparameters": hyper,
-                    }  # fmt: skip
-                    row = next((r for r in before if settings.items() <= r.items()), None)
-                    if row is None:
-                        row = settings | raced(settings)
-                        if args.output:
-                            store.append(args.output, row)
-                    rows.append(row)
-                    print(f"{learner_label(name)}, seed {seed}: {told(row)}", flush=True)
+        with live_view() as show:
+            for settings in trainings(args, names):
+                row = next((row for row in before if settings.items() <= row.items()), None)
+                if row is None:
+                    row = raced(settings, lambda now: show([*rows, now]))
+                    if args.output and "failed" not in row:
+                        store.append(args.output, row)
+                rows.append(row)
+                show(rows)
+                print(f"{learner_label(row['algo'])}, seed {row['seed']}: {told(row)}", flush=True)
     except KeyboardInterrupt:
+        kept = " What was finished is kept; re-run the command to resume." if args.output and rows else ""
+        print(f"\nStopped.{kept}", file=sys.stderr)
         return 130
-    print("\n" + "\n".join(aligned(score_cells(rows))))
-    if args.picture:
-        draw_scores(rows, args.picture)
-    return 0
+    finally:
+        done = [row for row in rows if "failed" not in row]
+        print("".join(f"\n{line}" for line in table_lines(done)), flush=True)
+    if args.picture and done:
+        draw_scores(done, args.picture)
+    return 0 if len(done) == len(rows) else 1
 
 
-def raced(settings: dict[str, Any]) -> dict[str, Any]:
-    """Train in a new process; return the curve and both clocks."""
+def trainings(args: argparse.Namespace, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the settings of each training."""
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
+        for name in names:
+            hyper = zoo_hyperparameters(name, args.env)
+            steps = args.steps or int(hyper["n_timesteps"])
+            yield {"env": args.env, "algo": name, "seed": seed, "steps": steps, "hyperparameters": hyper}
+
+
+def earlier_rows(file: Path) -> list[dict[str, Any]]:
+    """Return the trainings that a file holds, or raise a UserError if there is anything else in it."""
+    found = list(store.rows(file))
+    refuse = f"{file} is not a file of a race ({{}}); choose another --output, or remove it"
+    if not found and file.exists() and file.read_bytes().strip():
+        raise UserError(refuse.format("no line of it is JSON"))
+    for number, row in enumerate(found, 1):
+        try:
+            Row.model_validate(row)
+        except ValidationError as error:
+            first = error.errors()[0]
+            what = " ".join(map(str, (*first["loc"], first["msg"])))
+            raise UserError(refuse.format(f"row {number}: {what}")) from error
+    return found
+
+
+# --- one training -------------------------------------------------------------------------------------------
+
+_events: Any = None
+
+
+def _begin(events: Any) -> None:
+    global _events
+    _events = events
+
+
+def raced(settings: dict[str, Any], show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Train in a new process, and show its progress; return the curve and both clocks, or why it failed."""
     started = time.perf_counter()
-    with workers.processes(1) as submit:
-        found = submit(train_seed, settings).result()
-    return found | {"process_seconds": round(time.perf_counter() - started - found.pop("tests_seconds"), 3)}
+    now = settings | {"trained": 0, "seconds": 0.0, "curve": []}
+    show(now)
+    events = multiprocessing.get_context("spawn").Queue()
+    # The folder is this process's, so that it goes even if the other one is killed.
+    with tempfile.TemporaryDirectory() as folder, workers.processes(1, _begin, events) as submit:
+        future = submit(train_seed, settings, Path(folder))
+        while not future.done():
+            with suppress(queue.Empty):
+                now = settings | events.get(timeout=0.02)
+                show(now)
+        error = future.exception()
+    if error is not None:
+        return now | {"failed": str(error) if isinstance(error, UserError) else workers.died(error)}
+    found = future.result()
+    whole = time.perf_counter() - started - found.pop("tests_seconds")
+    return settings | found | {"process_seconds": round(whole, 3)}
 
 
-def train_seed(settings: dict[str, Any]) -> dict[str, Any]:
+def train_seed(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Train one seed, and note each test: (steps, seconds, seconds on the processor, score)."""
     learners.TESTS, learners.TEST_EPISODES = TESTS, EPISODES
     curve: list[tuple[int, float, float, float]] = []
-    started, trained = time.perf_counter(), 0.0
+    started, trained, last = time.perf_counter(), 0.0, 0.0
+
+    def show(run: Run) -> None:
+        nonlocal last
+        if time.monotonic() - last > 0.2:
+            last = time.monotonic()
+            _events.put({"trained": run.trained, "seconds": run.seconds, "curve": list(curve)})
 
     def tested(run: Run) -> None:
         nonlocal trained
@@ -123,19 +211,76 @@ def train_seed(settings: dict[str, Any]) -> dict[str, Any]:
         steps, seconds, mean = run.curve[-1]
         value = score(run.env, mean) or 0.0
         curve.append((steps, seconds, round(run.processor_seconds, 3), round(value, 4)))
+        show(run)
 
-    with tempfile.TemporaryDirectory() as folder:
-        run = Run(Path(folder), **settings)
-        learners.train_rest(run, show=lambda run: None, tested=tested)
-        result = run.load_result() or {}
+    run = Run(folder, **settings)
+    learners.train_rest(run, show=show, tested=tested)
+    result = run.load_result() or {}
     return {
         "score": result["score"], "seconds": run.seconds, "processor_seconds": run.processor_seconds,
         "tests_seconds": trained - run.seconds, "curve": curve,
+        "machine": result["machine"], "versions": result["versions"],
     }  # fmt: skip
+
+
+# --- what is shown ------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def live_view() -> Iterator[Callable[[Sequence[dict[str, Any]]], None]]:
+    """Show a table of trainings below what is printed; in a pipe there is none."""
+    if not sys.stdout.isatty():
+        yield lambda rows: None
+        return
+    from rich.live import Live
+
+    with Live(auto_refresh=False) as live:
+        # The last ones, for the table must fit on the screen.
+        yield lambda rows: live.update(live_table(rows[3 - live.console.height :]), refresh=True)
+
+
+def live_table(rows: Sequence[dict[str, Any]]) -> Any:
+    """Return a table of trainings, with their scores over seconds and steps on axes that all share."""
+    from rich.table import Column, Table
+
+    points = [point for row in rows for point in row["curve"]]
+    steps, seconds = (max((point[clock] for point in points), default=0) for clock in (0, 1))
+    numbers = [Column(name, justify="right", no_wrap=True) for name in ("seed", "steps", "s", "score")]
+    curves = [Column(name, no_wrap=True) for name in (f"to {seconds:.1f} s", f"to {steps:,} steps")]
+    table = Table("", *numbers, *curves, box=None, pad_edge=False)
+    for row in rows:
+        curve, running = row["curve"], "trained" in row
+        trained = row["trained"] if running else curve[-1][0]
+        value = row.get("score", curve[-1][-1] if curve else None)
+        table.add_row(
+            learner_label(row["algo"]), str(row["seed"]), f"{trained:,}", f"{row['seconds']:.1f}",
+            "failed" if "failed" in row else "" if value is None else f"{value:.3f}",
+            small_curve(curve, 1, seconds), small_curve(curve, 0, steps),
+            style="bold" if running and "failed" not in row else "",
+        )  # fmt: skip
+    return table
+
+
+def small_curve(curve: Sequence[Sequence[float]], clock: int, end: float) -> str:
+    """Draw scores from 0 to 1 in a line, over steps (clock 0) or seconds (1) from 0 to an end.
+
+    Examples
+    --------
+    >>> small_curve([(0, 0.0, 0.0, 0.0), (50, 1.0, 1.0, 0.5), (100, 2.0, 2.0, 1.0)], 0, 200)
+    '▁▁▁▄▄▄▄█'
+    """
+    if not curve or not end:
+        return ""
+    times = np.array([point[clock] for point in curve])
+    ticks = end * np.arange(1, WIDTH + 1) / WIDTH
+    before = np.searchsorted(times, ticks[ticks <= times[-1]], side="right") - 1
+    return "".join(HEIGHTS[int(7.99 * min(max(curve[k][-1], 0.0), 1.0))] for k in before)
 
 
 def told(row: dict[str, Any]) -> str:
     """Return a one-line summary of a training."""
+    if "failed" in row:
+        return f"failed: {row['failed']}"
     when = ", ".join(
         f"{level:g} never"
         if (time := first_reached(row["curve"], level)) is None
@@ -143,6 +288,13 @@ def told(row: dict[str, Any]) -> str:
         for level in LEVELS
     )
     return f"{when}; {row['score']:.3f} after {row['seconds']:.1f} s, process {row['process_seconds']:.1f} s"
+
+
+def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the lines of the table, and a warning where it mixes machines; nothing without trainings."""
+    places = sorted({row.get("machine", "an unknown machine") for row in rows})
+    mixed = [f"Times are from several machines: {'; '.join(places)}"] if len(places) > 1 else []
+    return aligned(score_cells(rows)) + mixed if rows else []
 
 
 def score_cells(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
@@ -189,25 +341,28 @@ def _text(value: float | None, form: str) -> str:
 
 
 def draw_scores(rows: Sequence[dict[str, Any]], file: Path) -> None:
-    """Draw scores against seconds of training."""
+    """Draw scores against seconds of training, and against steps."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
-    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(10.0, 4.5), layout="constrained")
     names = list(dict.fromkeys(row["algo"] for row in rows))
-    for row in rows:
-        _, seconds, _, scores = zip(*row["curve"], strict=True)
-        first = row["seed"] == rows[0]["seed"]
-        colour = f"C{names.index(row['algo'])}"
-        axes.plot(
-            seconds, scores, color=colour, alpha=0.7, label=learner_label(row["algo"]) if first else None
-        )
-    axes.set(xlabel="seconds of training, on one core", ylabel="score", ylim=(-0.05, 1.05))
-    axes.set_title(rows[0]["env"])
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=120)
+    axes = figure.subplots(1, 2, sharey=True)
+    for clock, ax, label in ((1, axes[0], "seconds of training, on one core"), (0, axes[1], "steps")):
+        for number, name in enumerate(names):
+            for curve in (row["curve"] for row in rows if row["algo"] == name):
+                times = [point[clock] for point in curve]
+                ax.plot(times, [point[-1] for point in curve], color=f"C{number}", alpha=0.7)
+            ax.plot([], [], color=f"C{number}", label=learner_label(name))
+        ax.set_xlabel(label)
+        ax.grid(alpha=0.3)
+    axes[0].set(ylabel="score", ylim=(-0.05, 1.05))
+    axes[0].legend(loc="best")
+    axes[1].xaxis.set_major_formatter(EngFormatter(sep=""))
+    figure.suptitle(rows[0]["env"])
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=file.suffix.lower()[1:], dpi=120)
+    store.write_file(file, drawn.getvalue())
 
 
 if __name__ == "__main__":

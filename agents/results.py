@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import errno
 import json
 import re
 import sys
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from agents.analysis import Data, best_first, chances_of_improvement, summarise_env, summarise_learners
 from agents.measure import Evaluation, MeasurementJob, measure_policies
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import installed_versions, machine
@@ -88,20 +87,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise UserError(f"--changed must be at least 1, got {args.changed}")
         if not args.new:
             load_summary(output)  # fail now, not after everything has been measured
-        with terminable():
-            found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
-            # Only now: another command may have written it meanwhile.
-            data = summarise_results(found, usual, {} if args.new else load_summary(output))
-            write_file(output / SUMMARY, results_json(data))
-            show(data, output)
+        found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
+        # Only now: another command may have written it meanwhile.
+        data = summarise_results(found, usual, {} if args.new else load_summary(output))
+        write_file(output / SUMMARY, results_json(data))
+        show(data, output)
         broken = [problem for evaluation, _ in found for problem in evaluation.broken]
         for problem in broken:
             print(f"left out: {problem}", file=sys.stderr)
         return 1 if broken else 0
-    except OSError as error:
-        full = " (no space left)" if error.errno == errno.ENOSPC else ""
-        print(f"agents.results: error: {error}{full}; what was measured before is kept", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("\nStopped. What was measured is kept; re-run the command to resume.", file=sys.stderr)
         return 130

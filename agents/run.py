@@ -7,22 +7,20 @@ readable folder.
 
 from __future__ import annotations
 
+import argparse
 import json
 import pickle
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
+from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from lag_envs import TASKS
-from lag_envs.errors import UserError, hint
+from lag_envs.errors import UserError, hint, run_shown
 from lag_envs.store import write_file
 
 SCHEMA = 1
@@ -31,6 +29,14 @@ SCHEMA = 1
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
+#: What a checkpoint begins with; the digest of the rest follows.
+DIGEST = b"sha256:"
+#: Kinds of what is read of a result.
+NUMBER = (int, float)
+KINDS: dict[str, Any] = {
+    "env": str, "algo": str, "seed": int, "steps": int, "hyperparameters": dict, "trained": int,
+    "wall_seconds": NUMBER, "mean_return": NUMBER, "score": (*NUMBER, type(None)),
+}  # fmt: skip
 
 
 def fresh_seeds(episodes: int) -> range:
@@ -99,7 +105,7 @@ class Run:
         names = ("trained", "seconds", "processor_seconds", "curve")
         progress = {name: getattr(self, name) for name in names}
         data = pickle.dumps({"settings": self.settings, "progress": progress, **content})
-        write_file(self.path(CHECKPOINT), data)
+        write_file(self.path(CHECKPOINT), DIGEST + sha256(data).digest() + data)
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint and adopt its progress, or return None if there is none.
@@ -113,7 +119,12 @@ class Run:
         if not file.exists():
             return None
         try:
-            content = pickle.loads(file.read_bytes())
+            data = file.read_bytes()
+            if data.startswith(DIGEST):  # earlier versions wrote none
+                digest, data = data[len(DIGEST) :][:32], data[len(DIGEST) + 32 :]
+                if sha256(data).digest() != digest:
+                    raise ValueError("it is damaged, its digest is another")
+            content = pickle.loads(data)
             settings, progress = content["settings"], content["progress"]
             for name in progress:
                 setattr(self, name, progress[name])
@@ -130,6 +141,10 @@ class Run:
             return None
         content = read_result(file)
         self.check_settings(content, file)
+        if not self.path(MODEL).exists():
+            raise UserError(
+                f"{file} is there, but no {MODEL}; remove it to train again, or start over with --new"
+            )
         return content
 
     def check_settings(self, found: dict[str, Any], file: Path) -> None:
@@ -172,8 +187,12 @@ def read_result(file: Path) -> dict[str, Any]:
             raise ValueError("it was not written by this version")
         if not isinstance(content["evaluation"]["returns"], list):
             raise ValueError("its returns are not a list")
-        for name in ("trained", "wall_seconds", "mean_return", "score", "curve", "seed"):
-            content[name]
+        for name, kind in KINDS.items():
+            if not isinstance(content[name], kind):
+                raise ValueError(f"its {name} is {content[name]!r}")
+        for point in content["curve"]:
+            if len(point) != 3 or not all(isinstance(number, NUMBER) for number in point):
+                raise ValueError(f"its curve has {point!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file} cannot be read ({error}); remove it, or start over with --new") from error
     return content
@@ -219,35 +238,43 @@ def known_name(kind: str, name: str, known: Iterable[str]) -> str:
     raise UserError(f"there is no {kind} {name!r}; {hint(name, known)}")
 
 
+def check_numbers(args: argparse.Namespace, **least: int) -> None:
+    """Raise a UserError for a number among the options that is too small, or too large for a seed."""
+    for name, smallest in least.items():
+        value = getattr(args, name)
+        if value is not None and not smallest <= value < 2**31:
+            option = "--" + name.replace("_", "-")
+            raise UserError(f"{option} must lie between {smallest} and 2147483647, got {value}")
+
+
+def check_writable(file: Path) -> None:
+    """Raise a UserError for a file that cannot be written or grow, before hours of work on its content."""
+    new = not file.exists()
+    if not new and not file.is_file():
+        raise UserError(f"{file} is no regular file: it cannot be kept for the next time")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("ab", buffering=0) as out:
+            size = out.tell()
+            fits = out.write(bytes(4096)) == 4096
+            out.truncate(size)
+    except OSError as error:
+        raise UserError(f"{file} cannot be written: {error.strerror}") from error
+    finally:
+        if new:
+            file.unlink(missing_ok=True)
+    if not fits:
+        raise UserError(f"{file} cannot be written: no space left")
+
+
 def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Make a command's function print a UserError and return 2."""
+    """Let a command's function show its errors in a line and obey SIGTERM, see `run_shown`."""
 
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)
         def run(arguments: Sequence[str] | None = None) -> int:
-            try:
-                return main(arguments)
-            except UserError as error:
-                print(f"{program}: error: {error}", file=sys.stderr)
-                return 2
+            return run_shown(program, lambda: main(arguments))
 
         return run
 
     return decorated
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from agents.learners import LEARNERS, OWN, learner_label
 from agents.optimum import DEFAULT_FOLDER, Solution, nodes, played, solvable
-from agents.run import MODEL, UserError, check_env
+from agents.run import MODEL, check_env, reports_errors
 from agents.value_iteration import CacheError
 from lag_envs import TASKS
 from lag_envs.controllers import controllers
@@ -175,29 +175,26 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.submit")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where something could not be submitted, 2 for a mistake of the user's."""
     args = parser().parse_args(arguments)
     failed = 0
-    try:
-        envs = [check_env(name) for name in args.envs] if args.envs else boards()
-        for env_id in dict.fromkeys(envs):
-            for name, make in entrants(env_id, args.runs, args.optimum):
-                folder = args.out / f"{env_id}-{folder_part(name)}"
-                print(folder, flush=True)
-                try:
-                    if folder.exists():
-                        if not args.new:
-                            load(folder)
-                            continue
-                        shutil.rmtree(folder)
-                    make(folder)
-                except (Refused, ExportError, CacheError) as error:
-                    print(f"  cannot be submitted: {error}", file=sys.stderr)
-                    failed += 1
-    except (UserError, OSError) as error:
-        print(f"agents.submit: error: {error}", file=sys.stderr)
-        return 2
+    envs = [check_env(name) for name in args.envs] if args.envs else boards()
+    for env_id in dict.fromkeys(envs):
+        for name, make in entrants(env_id, args.runs, args.optimum):
+            folder = args.out / f"{env_id}-{folder_part(name)}"
+            print(folder, flush=True)
+            try:
+                if folder.exists():
+                    if not args.new:
+                        load(folder)
+                        continue
+                    shutil.rmtree(folder)
+                make(folder)
+            except (Refused, ExportError, CacheError) as error:
+                print(f"  cannot be submitted: {error}", file=sys.stderr)
+                failed += 1
     return 1 if failed else 0
 
 

@@ -32,9 +32,10 @@ from agents.run import (
     RESULT,
     Run,
     UserError,
+    check_numbers,
     known_name,
     own_env,
-    terminable,
+    reports_errors,
 )
 from lag_envs import TASKS, workers
 from lag_envs.options import module_parser
@@ -104,23 +105,20 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.train")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a seed failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    try:
-        runs = planned_runs(args)
-        todo = [run for run in runs if run.load_result() is None]
-        for run in runs:
-            if run not in todo:
-                print(f"{run.name}: finished before")
-        parallel_map = (
-            partial(on_ray, address=args.ray) if args.ray else partial(train_in_processes, jobs=args.jobs)
-        )
-        failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
-        print_returns([run for run in runs if run.name not in failed])
-    except UserError as error:
-        print(f"agents.train: error: {error}", file=sys.stderr)
-        return 2
+    runs = planned_runs(args)
+    todo = [run for run in runs if run.load_result() is None]
+    for run in runs:
+        if run not in todo:
+            print(f"{run.name}: finished before")
+    parallel_map = (
+        partial(on_ray, address=args.ray) if args.ray else partial(train_in_processes, jobs=args.jobs)
+    )
+    failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
+    print_returns([run for run in runs if run.name not in failed])
     for name, reason in failed.items():
         print(f"{name} failed: {reason}", file=sys.stderr)
     if stopped or failed:
@@ -137,11 +135,7 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
     if args.ray and any(map(is_file, given)):
         raise UserError("--ray takes ids and module:ID; a file is not on the other machines")
     algos = [known_name("algorithm", name, LEARNERS) for name in dict.fromkeys(args.algo)]
-    for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1), ("jobs", 1)):
-        value = getattr(args, name)
-        if value is not None and not least <= value < 2**31:
-            option = "--" + name.replace("_", "-")
-            raise UserError(f"{option} must lie between {least} and 2147483647, got {value}")
+    check_numbers(args, seeds=1, first_seed=0, steps=1, jobs=1)
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
     runs = []
@@ -211,7 +205,7 @@ def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> st
     except UserError as error:
         return str(error)
     except OSError as error:
-        return f"{error}; what was saved before is kept"
+        return f"{error}; what was saved before is kept" if run.path(CHECKPOINT).exists() else str(error)
     except Exception:
         return traceback.format_exc()
     return ""
@@ -314,7 +308,7 @@ def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str
         dynamic_ncols=True, initial=sum(steps.values()),
     )  # fmt: skip
     try:
-        with terminable(), parallel_map(runs) as poll, bar:
+        with parallel_map(runs) as poll, bar:
             while left:
                 event = poll()
                 if event is None:

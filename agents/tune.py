@@ -19,7 +19,7 @@ from scipy.optimize import differential_evolution
 from agents import learners
 from agents.learners import load_policy, zoo_hyperparameters
 from agents.results import ROOT, results_json
-from agents.run import Run, UserError, check_env, reports_errors, terminable
+from agents.run import Run, UserError, check_env, check_numbers, check_writable, reports_errors
 from lag_envs import workers
 from lag_envs.controllers import build
 from lag_envs.errors import hint
@@ -103,15 +103,16 @@ def drawn_changes(number: int) -> dict[str, Any]:
     return changed
 
 
-def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episodes: int) -> dict[str, Any]:
-    """Train one seed with changed settings; return its final return and its time."""
+def trial(
+    folder: Path, env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episodes: int
+) -> dict[str, Any]:
+    """Train one seed with changed settings, in a folder; return its final return and its time."""
     learners.TESTS, learners.EPISODES = 8, 1
     hyper = {**zoo_hyperparameters(LEARNER, env_id), **changed}
-    with tempfile.TemporaryDirectory() as folder:
-        run = Run(Path(folder), env_id, LEARNER, seed, steps, hyper)
-        learners.train_rest(run, show=lambda run: None, tested=lambda run: None)
-        seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + episodes)
-        mean = float(play(env_id, load_policy(run.folder), seeds).mean())
+    run = Run(folder, env_id, LEARNER, seed, steps, hyper)
+    learners.train_rest(run, show=lambda run: None, tested=lambda run: None)
+    seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + episodes)
+    mean = float(play(env_id, load_policy(run.folder), seeds).mean())
     return {
         "seed": seed, "trained": run.trained, "return": mean, "score": score(env_id, mean),
         "seconds": run.seconds, "processor_seconds": run.processor_seconds,
@@ -121,8 +122,8 @@ def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episod
 
 def search_settings(
     env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path
-) -> Any:
-    """Try untried settings, side by side; return everything tried so far."""
+) -> tuple[dict[str, Any], int]:
+    """Try untried settings, side by side; return everything tried so far, and how many trainings failed."""
     own = zoo_hyperparameters(LEARNER, env_id)
     about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
     about["changed_from"] = own
@@ -130,21 +131,26 @@ def search_settings(
     for number in range(len(data["settings"]), count):
         changed = {name: value for name, value in drawn_changes(number).items() if own[name] != value}
         data["settings"].append({"number": number, "changed": changed, "runs": []})
-    with workers.processes(jobs) as submit:
+    failed = 0
+    # The folder is this process's, so that it goes even if another one is killed.
+    with tempfile.TemporaryDirectory() as folder, workers.processes(jobs) as submit:
         futures = {}
         for setting in data["settings"][:count]:
+            number, changed = setting["number"], setting["changed"]
             done = {run["seed"] for run in setting["runs"]}
             for seed in sorted(set(range(seeds)) - done):
-                future = submit(trial, env_id, setting["changed"], seed, steps, episodes)
-                futures[future] = setting, seed
+                place = Path(folder, f"{number}-{seed}")
+                futures[submit(trial, place, env_id, changed, seed, steps, episodes)] = setting, seed
         for (setting, seed), found in workers.as_they_finish(futures):
             if isinstance(found, BaseException):
-                found = {"seed": seed, "failed": f"{type(found).__name__}: {found}".splitlines()[0]}
-            setting["runs"] = sorted([*setting["runs"], rounded_data(found)], key=lambda run: run["seed"])
-            write_file(file, results_json(data))
-            how = found.get("failed") or f"return {found['return']:.2f} in {found['seconds']:.0f} s"
+                failed += 1
+                how = f"failed: {workers.died(found)}"
+            else:
+                setting["runs"] = sorted([*setting["runs"], rounded_data(found)], key=lambda run: run["seed"])
+                write_file(file, results_json(data))
+                how = f"return {found['return']:.2f} in {found['seconds']:.0f} s"
             print(f"setting {setting['number']}, seed {seed}: {how}", flush=True)
-    return data
+    return data, failed
 
 
 def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -154,7 +160,9 @@ def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
     try:
         data = json.loads(file.read_text())
         different = [name for name, value in about.items() if data[name] != value]
-        [(s["number"], s["changed"], s["runs"]) for s in data["settings"]]
+        for s in data["settings"]:
+            s["runs"] = [run for run in s["runs"] if "failed" not in run]  # earlier versions stored them
+            s["number"], s["changed"], [(run["seed"], run["return"], run["trained"]) for run in s["runs"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{file} cannot be read ({error!r}); remove it, or choose another --output"
@@ -170,7 +178,7 @@ def ranked_cells(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return the cells of a table, best setting first by the mean return over its seeds."""
     rows = []
     for setting in data["settings"]:
-        returns = [run["return"] for run in setting["runs"] if "return" in run]
+        returns = [run["return"] for run in setting["runs"]]
         if returns:
             rows.append((float(np.mean(returns)), min(returns), setting))
     cells: list[tuple[str, ...]] = [("setting", "mean return", "lowest", "score", "changed")]
@@ -184,7 +192,7 @@ def ranked_cells(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def pace(data: Mapping[str, Any]) -> float:
     """Return how many steps a second of the processor trains, the median over all runs."""
-    runs = [run for setting in data["settings"] for run in setting["runs"] if "trained" in run]
+    runs = [run for setting in data["settings"] for run in setting["runs"]]
     return float(np.median([run["trained"] / run["processor_seconds"] for run in runs]))
 
 
@@ -198,47 +206,52 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("env", metavar="ENV", help="id of an environment")
     p.add_argument("--only", metavar="NAME", help="tune this controller only")
     p.add_argument("--episodes", type=int, help="episodes per trial (default 2000, with --settings 200)")
-    p.add_argument("--generations", type=int, default=15, help="default %(default)s")
+    p.add_argument("--generations", type=int, help="default 15")
     p.add_argument("--settings", type=int, metavar="N", help=f"try this many settings of {LEARNER} instead")
     p.add_argument("--steps", type=int, help="steps of each training (default: the task's own)")
-    p.add_argument("--seeds", type=int, default=2, help="trainings with each setting (default %(default)s)")
-    p.add_argument("--jobs", type=int, default=1, help="trainings at once (default %(default)s)")
+    p.add_argument("--seeds", type=int, help="trainings with each setting (default 2)")
+    p.add_argument("--jobs", type=int, help="trainings at once (default 1)")
     p.add_argument("--output", type=new_file, metavar="FILE", help="default agents/results/tuning/ENV.json")
     return p
 
 
 @reports_errors("agents.tune")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 for a user's mistake, 130 when interrupted."""
+    """Run the command; return 0, 1 where a training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
     known = tunable(check_env(args.env))
-    for name in ("episodes", "generations", "settings", "steps", "seeds", "jobs"):
-        if (value := getattr(args, name)) is not None and value < 1:
-            raise UserError(f"--{name} must be at least 1, got {value}")
+    check_numbers(args, episodes=1, generations=1, settings=1, steps=1, seeds=1, jobs=1)
+    other = ("only", "generations") if args.settings else ("steps", "seeds", "jobs", "output")
+    if given := [name for name in other if getattr(args, name) is not None]:
+        raise UserError(f"--{given[0]} has no effect {'with' if args.settings else 'without'} --settings")
     if args.settings:
         steps = args.steps or int(zoo_hyperparameters(LEARNER, args.env)["n_timesteps"])
         file = args.output or RESULTS / f"{args.env}.json"
+        check_writable(file)
         try:
-            with terminable():
-                data = search_settings(
-                    args.env, args.settings, args.seeds, steps, args.episodes or 200, args.jobs, file
-                )
+            counts = args.settings, args.seeds or 2, steps, args.episodes or 200, args.jobs or 1
+            data, failed = search_settings(args.env, *counts, file)
         except KeyboardInterrupt:
-            print("\nStopped. What was tried is kept; re-run the command to resume.", file=sys.stderr)
+            kept = " What was tried is kept; re-run the command to resume." if file.exists() else ""
+            print(f"\nStopped.{kept}", file=sys.stderr)
             return 130
+        if failed:
+            print(f"{failed} of the trainings failed; re-run the command to try them again", file=sys.stderr)
+        if not any(setting["runs"] for setting in data["settings"]):
+            return 1
         print("\n" + "\n".join(aligned(ranked_cells(data))))
         hours = 5 * 5e6 / pace(data) / 3600.0
         print(
             f"{pace(data):,.0f} steps in a second of the processor, {hours:.2f} h for five seeds of 5M steps"
         )
         print(f"Written to {file}")
-        return 0
+        return 1 if failed else 0
     if args.only not in (None, *known):
         there = hint(args.only, known, "" if known else "there is nothing to tune")
         raise UserError(f"nothing of {args.only!r} can be tuned; {there}")
     for name in known:
         if args.only in (None, name):
-            numbers, mean = tune(args.env, name, args.episodes or 2000, args.generations)
+            numbers, mean = tune(args.env, name, args.episodes or 2000, args.generations or 15)
             print(f"{args.env}, {name}: {numbers}, return {mean:.3f}", flush=True)
     return 0
 

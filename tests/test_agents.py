@@ -1,3 +1,4 @@
+import errno
 import json
 import re
 import warnings
@@ -153,7 +154,7 @@ def demonstrate(monkeypatch, capsys, tmp_path):
     return demonstrate
 
 
-def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
+def test_demo_trains_compares_and_shows(demonstrate, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
     assert status == 0, output
@@ -170,6 +171,23 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id, "--no-video")
     assert status == 0 and "switching line" in output and not (folder / "episode.mp4").exists()
     assert (folder / "model.zip").stat().st_mtime_ns == before
+    assert "seed 0: finished before" in output and "0 of" not in output
+    # A video that fails costs no more than itself.
+    (folder / "comparison.json").unlink()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "episode.mp4")
+
+    monkeypatch.setattr(demo, "record_video", full)
+    status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
+    assert status == 1 and "agents.demo: error: " in output and "episode.mp4" in output
+    assert "switching line" in output and (folder / "comparison.json").exists()
+    (folder / "model.zip").unlink()
+    status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
+    assert status == 2 and "but no model.zip; remove it to train again, or start over with --new" in output
+    (folder / "model.zip").write_bytes(b"")
+    status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
+    assert status == 2 and "cannot be read" in output and "train it again, with --new" in output
     status, output = demonstrate("--env", incline.Brake.id, "--seed", "5", "--steps", "5000")
     assert status == 2 and "belongs to a run with seed 0, not 5; --new starts over" in output
 
@@ -179,7 +197,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     [
         (["--env", "PivotedBr-v0"], "did you mean PivotedBar-v0"),
         (["--algo", "fastppo"], "did you mean fast_ppo"),
-        (["--steps", "0"], "--steps must be at least 1"),
+        (["--steps", "0"], "--steps must lie between 1"),
         (["--seed", "-1"], "--seed must lie between"),
     ],
 )

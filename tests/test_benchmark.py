@@ -5,7 +5,9 @@ import json
 import re
 import subprocess
 import sys
+import threading
 import time
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -13,7 +15,7 @@ import pytest
 from covering import covering
 
 import lag_envs
-from lag_envs import cli
+from lag_envs import cli, workers
 from lag_envs.benchmark import cold_start, contestants, divisions, docs, energies, jacobians, measurement
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.console import short
@@ -234,6 +236,55 @@ def test_breaking_off_keeps_and_writes_what_was_measured(tmp_path, capsys, monke
     assert report["cold_start"] == {}
     assert row(report, ID, "made")["rates"]
     assert "interrupted" in capsys.readouterr().out
+
+
+def test_it_stops_between_samples_when_asked(monkeypatch):
+    """Also where the code that is measured swallows interrupts, as JAX's does."""
+    asked = threading.Event()
+    monkeypatch.setattr(workers, "_asked", asked)
+    rows = [Contestant("a", "b", "vector", 1, lambda: lambda steps: steps) for _ in range(2)]
+
+    def later():
+        if rows[0].rates:
+            asked.set()
+        return time.perf_counter()
+
+    assert not measure_rates(rows, 100, 1e-9, later)
+    assert [len(row.rates) for row in rows] in ([1, 0], [1, 1])
+    times = {}
+    assert not cold_start.cold_starts(ID, 1, times) and times == {}
+    for section in (partial(divisions.divisions, [ID]), partial(jacobians.jacobians, 1, time.perf_counter)):
+        with pytest.raises(KeyboardInterrupt):
+            section()
+
+
+def interrupted(*args):
+    raise KeyboardInterrupt
+
+
+def failing(*args):
+    raise ValueError("no luck")
+
+
+@pytest.mark.parametrize(("place", "name"), [(cold_start, "cold_start"), (measurement, "divisions")])
+@pytest.mark.parametrize("ends", [interrupted, failing])
+def test_whatever_ends_a_later_section_the_rates_are_kept(place, name, ends, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(contestants, "PEERS", [])
+    monkeypatch.setattr(place, name, ends)
+    given = tiny(tmp_path, sizes=(1,), cold_starts=int(name == "cold_start"), divisions=True)
+    with pytest.raises(ValueError, match="no luck") if ends is failing else nullcontext():
+        bench(given)
+    report = json.loads((tmp_path / "speed.json").read_text())
+    assert not report["complete"] and len(row(report, ID)["rates"]) == 2
+    assert report["cold_start"] == {} and "x CartPole" in capsys.readouterr().out
+
+
+def test_what_cannot_be_written_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(contestants, "PEERS", [])
+    with pytest.raises(IsADirectoryError):
+        bench(tiny(tmp_path, sizes=(1,), output=str(tmp_path)))
+    out = capsys.readouterr().out
+    assert re.search(rf"lag_envs +{ID} +vector", out) and "written" not in out
 
 
 def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):

@@ -112,12 +112,17 @@ def learnt(run):
 
 
 @contextmanager
-def here(*_):
+def here(count, begin=None, *given):
     """Work in this process instead of others."""
+    if begin:
+        begin(*given)
 
     def submit(function, *arguments):
         future = Future()
-        future.set_result(function(*arguments))
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
         return future
 
     yield submit
@@ -430,6 +435,7 @@ def test_race_tells_when_levels_are_reached(names, tmp_path, monkeypatch, capsys
         assert steps[0] == 0 and steps[-1] >= 256
         assert sorted(seconds) == list(seconds) and sorted(processor) == list(processor)
         assert seconds[-1] == pytest.approx(row["seconds"], abs=1e-3) and seconds[-1] < row["process_seconds"]
+        assert "cores" in row["machine"] and row["versions"]["torch"]
     assert not drawn or picture.read_bytes().startswith(b"\x89PNG")
     assert race.main(given) == 0 and file.read_text().splitlines() == [
         json.dumps(row) for row in rows

@@ -229,7 +229,7 @@ def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
     ("error", "status", "message"),
     [
         (KeyboardInterrupt(), 130, "What was measured is kept"),
-        (OSError(errno.ENOSPC, "No space left on device"), 2, "what was measured before is kept"),
+        (OSError(errno.ENOSPC, "No space left on device"), 1, "No space left on device"),
     ],
 )
 def test_command_that_is_broken_off(error, status, message, command, tmp_path, monkeypatch):

@@ -1,12 +1,15 @@
 """Files that survive kills and full disks. Kills at every step of a board are in test_board_log.py."""
 
+import argparse
 import errno
 import os
+import stat
 from pathlib import Path
 
 import pytest
 
 from lag_envs import store
+from lag_envs.options import new_file, new_picture
 
 
 @pytest.mark.parametrize("sync", [False, True])
@@ -26,9 +29,46 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch,
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(*place, full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space left") as refused:
         store.write_file(file, "new")
+    assert refused.value.filename == str(file)
     assert file.read_text() == "old" and os.listdir(tmp_path) == ["file"]
+
+
+def test_a_link_stays_and_what_it_leads_to_is_written(tmp_path):
+    (tmp_path / "link").symlink_to("there/file")
+    for text in ("first", "second"):
+        store.write_file(tmp_path / "link", text)
+        assert (tmp_path / "link").is_symlink() and (tmp_path / "there" / "file").read_text() == text
+    assert os.listdir(tmp_path / "there") == ["file"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes in the file system")
+def test_pipes_and_devices_are_written_to_and_stay(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        store.write_file(pipe, "text")
+        assert os.read(reader, 10) == b"text" and stat.S_ISFIFO(pipe.stat().st_mode)
+    finally:
+        os.close(reader)
+    assert os.listdir(tmp_path) == ["pipe"]
+    assert new_file(str(pipe)) == pipe and new_file(os.devnull) == Path(os.devnull)
+
+
+@pytest.mark.parametrize("name", ["", "long" * 100])
+def test_errors_name_the_file_that_was_asked_for(tmp_path, name):
+    for write in (lambda path: store.write_file(path, ""), lambda path: store.append(path, {})):
+        with pytest.raises(OSError) as refused:
+            write(tmp_path / name)
+        assert refused.value.filename == str(tmp_path / name)
+
+
+def test_a_picture_is_known_by_its_ending_in_any_case(tmp_path):
+    assert new_picture(str(tmp_path / "a.PNG")) == tmp_path / "a.PNG"
+    with pytest.raises(argparse.ArgumentTypeError, match=r"ends with \.png, \.svg, \.pdf, got 'a\.gif'"):
+        new_picture("a.gif")
 
 
 def test_rows_after_a_kill_in_the_middle_of_one(tmp_path):

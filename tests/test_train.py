@@ -204,18 +204,38 @@ def test_checkpoints_of_others_and_damaged_ones_are_refused(tmp_path):
     ):
         with pytest.raises(UserError, match=message):
             go(other)
-    for damaged in (b"", b"nonsense", data[: len(data) // 2]):
+    flipped = bytearray(data)
+    flipped[-100] ^= 1
+    for damaged in (b"", b"nonsense", data[: len(data) // 2], bytes(flipped)):
         begun.path(run.CHECKPOINT).write_bytes(damaged)
         with pytest.raises(UserError, match=r"checkpoint.pkl cannot be read .*--new starts over"):
             go(make_run(tmp_path))
+    begun.path(run.CHECKPOINT).write_bytes(
+        data[len(run.DIGEST) + 32 :]
+    )  # as versions without digest wrote it
+    assert make_run(tmp_path).load_checkpoint() is not None
     begun.path(run.CHECKPOINT).write_bytes(data)
     assert go(make_run(tmp_path))
 
 
+RESULT = {
+    "schema": 1, "env": ENV, "algo": "ppo", "seed": 3, "steps": 400, "hyperparameters": {}, "trained": 400,
+    "wall_seconds": 1.0, "mean_return": 1.0, "score": None, "curve": [[0, 0.0, 1.0]],
+    "evaluation": {"returns": [1.0]},
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "content", ["{", "[]", '{"schema": 0}', '{"schema": 1, "evaluation": {"returns": 1}}']
-)
+    "content",
+    [
+        "{", "[]", '{"schema": 0}', '{"schema": 1, "evaluation": {"returns": 1}}',
+        *(json.dumps(RESULT | {name: ["?"]}) for name in RESULT),
+        *(json.dumps(RESULT | {"curve": curve}) for curve in ([1], [[1, 2]], [[1, 2, "3"]])),
+    ],
+)  # fmt: skip
 def test_a_damaged_result_is_named(content, tmp_path):
+    (tmp_path / run.RESULT).write_text(json.dumps(RESULT))
+    assert run.read_result(tmp_path / run.RESULT) == RESULT
     (tmp_path / run.RESULT).write_text(content)
     with pytest.raises(UserError, match=r"result.json cannot be read"):
         make_run(tmp_path).load_result()
@@ -243,12 +263,61 @@ def test_a_full_disk_loses_nothing_that_was_saved(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
         reason = train.train_run(make_run(tmp_path), events.append)
+        nothing = train.train_run(make_run(tmp_path / "new"), events.append)
     assert "No space left on device" in reason and "what was saved before is kept" in reason
+    assert "No space left on device" in nothing and "kept" not in nothing
     assert going.path(run.CHECKPOINT).read_bytes() == saved
     assert go(make_run(tmp_path))
 
 
 # --- the command ---
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "told"),
+    [
+        (OSError(errno.EROFS, "Read-only file system", "runs/x"), 1, ("x: error: ", "Read-only", "runs/x")),
+        (KeyboardInterrupt(), 130, ()),
+    ],
+)
+def test_refusals_of_the_system_are_told_in_a_line(error, status, told, capsys):
+    @run.reports_errors("x")
+    def main(arguments):
+        raise error
+
+    assert main([]) == status
+    output = capsys.readouterr().err.strip()
+    assert all(word in output for word in told) and "\n" not in output
+
+
+def test_a_reader_that_leaves_ends_a_command_quietly():
+    script = (
+        "from agents import run\n"
+        "@run.reports_errors('x')\n"
+        "def main(arguments):\n"
+        "    while True: print('line', flush=True)\n"
+        "raise SystemExit(main([]))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"},
+    )  # fmt: skip
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait(60) == 0
+    process.stderr.close()
+
+
+def test_a_result_without_its_model_is_not_finished(command, tmp_path):
+    folder = tmp_path / ENV / "ppo" / "seed3"
+    folder.mkdir(parents=True)
+    about = {"hyperparameters": zoo_hyperparameters("ppo", ENV)}
+    (folder / run.RESULT).write_text(json.dumps(RESULT | about))
+    given = [ENV, "--first-seed", "3", "--steps", "400"]
+    status, output = command(*given)
+    assert status == 2 and "but no model.zip; remove it to train again, or start over with --new" in output
+    (folder / run.MODEL).write_bytes(b"")
+    assert command(*given)[0] == 0
 
 
 @pytest.mark.slow

@@ -103,6 +103,48 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
         time.sleep(0.05)
 
 
+STOPPABLE = """
+import sys, time
+from lag_envs.workers import obey_parent, stopping_point
+obey_parent()
+print("begins", flush=True)
+try:
+    for _ in range(600):
+        time.sleep(0.1)
+        if sys.argv[1] == "obeys":
+            stopping_point()
+except KeyboardInterrupt:
+    print("keeps it", flush=True)
+    sys.exit(5)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals to a process group")
+@pytest.mark.parametrize(
+    ("child", "signals", "told", "status"),
+    [
+        ("obeys", [signal.SIGINT], "keeps it\n", 5),
+        ("obeys", [signal.SIGTERM], "keeps it\n", 5),
+        ("does not", [signal.SIGINT, signal.SIGINT], "", 130),
+        ("does not", [signal.SIGKILL], "", -signal.SIGKILL),
+    ],
+)
+def test_a_process_stops_when_asked_and_is_killed_when_asked_again(child, signals, told, status):
+    """Ctrl-C in a terminal reaches both, a kill of the parent only that; in no case does the other go on."""
+    script = "import os, sys; from lag_envs.workers import run_stoppable\n"
+    script += f"sys.exit(run_stoppable([sys.executable, '-c', {STOPPABLE!r}, {child!r}], os.environ))"
+    parent = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    assert parent.stdout.readline() == "begins\n"
+    for number in signals:
+        (os.killpg if number == signal.SIGINT else os.kill)(parent.pid, number)
+        time.sleep(0.5)
+    out, _ = parent.communicate(timeout=60.0)  # ends with the last process that holds the pipe
+    assert (out, parent.returncode) == (told, status)
+
+
 def test_a_cluster_that_does_not_start(monkeypatch):
     def init(*args, **kwargs):
         raise Exception("The current node timed out during startup.")  # like Ray

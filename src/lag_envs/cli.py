@@ -6,7 +6,6 @@ To add a subcommand, write a file in `lag_envs.commands` and add its `Command` t
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 
@@ -22,7 +21,7 @@ from lag_envs.commands.new import NEW
 from lag_envs.commands.order import ORDER
 from lag_envs.commands.report import REPORT
 from lag_envs.commands.show import PLAY, WATCH
-from lag_envs.errors import UserError
+from lag_envs.errors import run_shown
 
 #: In the order of ``lag-envs --help``.
 COMMANDS: tuple[Command, ...] = (
@@ -68,23 +67,16 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its status: 0, 2 for a mistake in the command line, 130 when interrupted."""
-    given = sys.argv[1:] if arguments is None else arguments
-    try:
-        args = parser(next((word for word in given if not word.startswith("-")), "")).parse_args(given)
-        if "run" not in args:
-            parser("").print_help(sys.stderr)
-            return 2
-        return args.run(args)
-    except UserError as error:
-        print(f"lag-envs: error: {error}", file=sys.stderr)
+    """Run the command and return its status, see `run_shown`; it is 2 for a mistake in the command line."""
+    return run_shown("lag-envs", lambda: _run(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(given: Sequence[str]) -> int:
+    args = parser(next((word for word in given if not word.startswith("-")), "")).parse_args(given)
+    if "run" not in args:
+        parser("").print_help(sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:
-        # The reader, such as `head`, has left; nothing more must be written, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    return args.run(args)
 
 
 if __name__ == "__main__":

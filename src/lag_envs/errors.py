@@ -1,14 +1,84 @@
-"""The error that commands show without a traceback, and hints for names that do not exist."""
+"""Errors that commands show without a traceback, and hints for names that do not exist."""
 
 import difflib
+import os
+import signal
+import sys
+import threading
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from types import CodeType
 from typing import Any
 
 
 class UserError(Exception):
     """A user's mistake; only its text is shown, without a traceback."""
+
+
+def run_shown(program: str, run: Callable[[], int]) -> int:
+    """Run a command, show its errors in a line, and treat SIGTERM like Ctrl-C; return its exit status.
+
+    It is 2 for a `UserError`, 1 if the system refuses something, as when a disk is full, 130 if interrupted.
+    """
+    with terminable():
+        try:
+            status = run()
+            sys.stdout.flush()  # what it cannot take is told below, not by Python at exit
+            return status
+        except UserError as error:
+            print(f"{program}: error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            return 130
+        except BrokenPipeError:  # the reader, such as `head`, has left
+            _drop_output()
+            return 0
+        except OSError as error:
+            try:
+                sys.stdout.flush()
+            except OSError:
+                _drop_output()
+                error.filename = error.filename or "standard output"
+            print(f"{program}: error: {reason(error)}", file=sys.stderr)
+            return 1
+
+
+def _drop_output() -> None:
+    """Write nothing more to standard output, not even at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def reason(error: OSError) -> str:
+    """Return what the system refused, and for which file.
+
+    Examples
+    --------
+    >>> reason(FileNotFoundError(2, "No such file or directory", "speed.json"))
+    'speed.json: No such file or directory'
+    >>> reason(OSError(28, "No space left on device")), reason(OSError("no luck"))
+    ('No space left on device', 'no luck')
+    """
+    if error.strerror is None:
+        return str(error)
+    return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:

@@ -30,15 +30,20 @@ def new_file(text: str) -> Path:
         If no such file can be written. Missing folders are made when it is.
     """
     path = Path(text)
-    folder = next(parent for parent in path.absolute().parents if parent.exists())
-    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        wrong = "is a folder" if path.is_dir() else f"cannot be written: {folder} is no folder to write to"
-        raise argparse.ArgumentTypeError(f"{text} {wrong}")
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text} is a folder")
+    if path.exists() and not path.is_file():  # a device or a pipe
+        if not os.access(path, os.W_OK):
+            raise argparse.ArgumentTypeError(f"{text} cannot be written to")
+        return path
+    folder = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{text} cannot be written: {folder} is no folder to write to")
     return path
 
 
 def new_picture(text: str) -> Path:
     """Return the file of an option for a picture, like `new_file`."""
-    if Path(text).suffix not in PICTURES:
+    if Path(text).suffix.lower() not in PICTURES:
         raise argparse.ArgumentTypeError(f"a picture's name ends with {', '.join(PICTURES)}, got {text!r}")
     return new_file(text)

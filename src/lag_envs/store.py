@@ -6,23 +6,45 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 
 def write_file(path: Path, data: bytes | str, sync: bool = False) -> None:
-    """Write a file whole or not at all; with `sync`, a power cut cannot lose it either."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    """Write a file whole or not at all; with `sync`, a power cut cannot lose it either.
+
+    Links stay, and what they lead to is written. Devices and pipes are written to, not replaced.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    if path.exists() and not path.is_file():
+        with named(path):
+            path.write_bytes(content)
+        return
+    place = Path(os.path.realpath(path))
+    part = place.with_name(f".{place.name}.{os.getpid()}.part")
+    with named(path, part):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(content)
+            if sync:
+                to_disk(part)
+            os.replace(part, place)
+            if sync:
+                to_disk(place.parent)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+@contextmanager
+def named(path: Path, part: Path | None = None) -> Iterator[None]:
+    """Name a file in errors that name none, as on a full disk, or only `part`, its unfinished copy."""
     try:
-        part.write_bytes(data.encode() if isinstance(data, str) else data)
-        if sync:
-            to_disk(part)
-        os.replace(part, path)
-        if sync:
-            to_disk(path.parent)
-    finally:
-        part.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.filename not in (None, str(part)):
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 def to_disk(path: Path) -> None:
@@ -39,7 +61,7 @@ def to_disk(path: Path) -> None:
 def append(path: Path, row: dict[str, Any]) -> None:
     """Append a row of JSON to a file, on a new line even after one that was cut off."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab+") as out:
+    with named(path), path.open("ab+") as out:
         if out.tell():
             out.seek(-1, os.SEEK_END)
             out.write(b"\n" * (out.read(1) != b"\n"))

@@ -1,6 +1,6 @@
 """Functions in other processes, or on the machines of a Ray cluster: a crash or hang costs only that work.
 
-Both context managers yield a function ``submit(function, *args, timeout=None)``, which returns a
+The context managers yield a function ``submit(function, *args, timeout=None)``, which returns a
 `concurrent.futures.Future`; `as_they_finish` waits for many.
 """
 
@@ -11,13 +11,15 @@ import multiprocessing
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar, cast
 
 Submit = Callable[..., Future]
 Key = TypeVar("Key")
@@ -102,16 +104,20 @@ def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
 
 def _begin(begin: Callable | None, args: Sequence[Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets Ctrl-C too, and ends its processes
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    if (parent := multiprocessing.parent_process()) is not None:
+        _end_after(parent.join)
     if begin is not None:
         begin(*args)
+
+
+def _end_after(wait: Callable[[], Any]) -> None:
+    """End this process, whatever it does, when a function returns."""
+
+    def end() -> None:
+        wait()
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 @contextmanager
@@ -163,3 +169,61 @@ def check_address(address: str) -> None:
             socket.create_connection((host, int(port)), timeout=10.0).close()
         except (OSError, ValueError, OverflowError) as error:
             raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
+
+
+# --- one process that keeps what it has when it is stopped --------------------------------------------------
+
+_asked = threading.Event()
+
+
+def run_stoppable(command: Sequence[str], environment: Mapping[str, str]) -> int:
+    """Run a command that calls `obey_parent`, and return its exit status.
+
+    At the first Ctrl-C or SIGTERM it is asked to stop, at the second it is killed. It cannot outlive this
+    process.
+    """
+    signals = (signal.SIGINT, signal.SIGTERM)
+    # On POSIX, the command goes on ignoring the terminal's Ctrl-C: only this process tells it.
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
+    got = 0
+
+    def stop(*_: Any) -> None:
+        nonlocal got
+        got += 1
+        if got > 1:
+            child.kill()
+            return
+        print("\nstopping after what is being measured; again: at once, without results", file=sys.stderr)
+        with suppress(BrokenPipeError, ValueError):  # it has just ended
+            os.write(pipe.fileno(), b".")
+
+    try:
+        with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE) as child:
+            pipe = cast(IO[bytes], child.stdin)
+            for number in signals:
+                signal.signal(number, stop)
+            status = child.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 130 if got > 1 else status
+
+
+def obey_parent() -> None:
+    """Let the parent stop this process, which ends with it, see `run_stoppable`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def listen() -> None:
+        while os.read(0, 1):
+            _asked.set()
+
+    _end_after(listen)
+
+
+def stopping_point() -> None:
+    """Raise KeyboardInterrupt if the parent asked this process to stop.
+
+    A signal could interrupt any code, of which some, such as JAX's, goes on as if nothing had happened.
+    """
+    if _asked.is_set():
+        raise KeyboardInterrupt

@@ -12,6 +12,7 @@ from typing import Any
 
 from lag_envs.benchmark.results import quartiles
 from lag_envs.progress import progress
+from lag_envs.workers import stopping_point
 
 #: The stages of a cold start after the start of the process; prints the seconds of each.
 COLD_START = """
@@ -47,10 +48,14 @@ def cold_starts(id: str, count: int, times: dict[str, list[list[float]]], files:
         try:
             for i in range(empty):
                 advance("cold start, cache empty")
-                times.setdefault("empty", []).append(cold_start(id, f"{folder}/{i}", files))
+                stopping_point()
+                stages = cold_start(id, f"{folder}/{i}", files)
+                times.setdefault("empty", []).append(stages)
             for _ in range(count):
                 advance("cold start, cache filled")
-                times.setdefault("filled", []).append(cold_start(id, f"{folder}/0", files))
+                stopping_point()
+                stages = cold_start(id, f"{folder}/0", files)
+                times.setdefault("filled", []).append(stages)
         except KeyboardInterrupt:
             return False
     return True

@@ -15,6 +15,7 @@ import numpy as np
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
+from lag_envs.workers import stopping_point
 
 #: Environments of a batch under random actions, and the interval of steps that are examined.
 BATCH, EVERY = 16, 5
@@ -47,6 +48,7 @@ def _divided(env_id: str) -> dict[str, Any]:
     parts: list[int] = []
     fastest = 0.0
     for step in range(limit):
+        stopping_point()
         before = envs.state
         _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
         fastest = max(fastest, float(np.abs(before[:, fast]).max()))

@@ -20,6 +20,7 @@ from lag_envs.scenes.derivation import code_of, form_of, motion_constants_of, st
 from lag_envs.stepping.compiling import compile_function
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.tasks import TASKS
+from lag_envs.workers import stopping_point
 
 #: Length of the step [s], states in a batch, and calls in a sample of single ones.
 DT, BATCH, CALLS = 0.02, 1024, 20
@@ -214,8 +215,10 @@ def _least(
     """Return the shortest time of each [s], without that of `before`; all of them run once first."""
     least = [float("inf")] * len(runs)
     for run in runs:
+        stopping_point()
         run()
     for _ in range(rounds):
+        stopping_point()
         for i, run in enumerate(runs):
             before()
             start = clock()

@@ -50,7 +50,10 @@ class BenchmarkSettings:
 
 
 def bench(settings: BenchmarkSettings) -> dict[str, Any]:
-    """Measure, print the tables, write the file if one is named, and return its contents."""
+    """Measure, print the tables, write the file if one is named, and return its contents.
+
+    Whatever fails or interrupts it, what was measured before is printed and written.
+    """
     for name in settings.files:
         registered(name)
     selection = settings.ids, settings.sizes, settings.keywords, settings.threads
@@ -59,9 +62,22 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         rows += of_energies(settings.sizes)
     times: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    complete = measure_rates(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
-    if complete and settings.cold_starts:
-        complete = cold_start.cold_starts(settings.ids[0], settings.cold_starts, times, settings.files)
+    sections: dict[str, Any] = {}
+    failure: Exception | None = None
+    try:
+        clock = CLOCKS[settings.clock]
+        complete = measure_rates(rows, settings.rounds, settings.seconds, clock)
+        if complete and settings.cold_starts:
+            complete = cold_start.cold_starts(settings.ids[0], settings.cold_starts, times, settings.files)
+        if complete and settings.jacobians:
+            sections["jacobians"] = jacobians(settings.rounds, clock)
+            sections["backwards"] = backwards(settings.rounds, clock)
+        if complete and settings.divisions:
+            sections["divisions"] = divisions(settings.ids)
+    except KeyboardInterrupt:
+        complete = False
+    except Exception as error:
+        complete, failure = False, error
     cold = {cache: cold_start.start_summary(some) for cache, some in times.items()}
     results = [row_summary(row, rows) for row in rows]
     report: dict[str, Any] = {
@@ -76,16 +92,16 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         "chains": chains(results),
         "speedups": speedups(rows),
         "arithmetic": arithmetic(rows),
-    }
-    if settings.jacobians and complete:
-        report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
-        report["backwards"] = backwards(settings.rounds, CLOCKS[settings.clock])
-    if settings.divisions and complete:
-        report["divisions"] = divisions(settings.ids)
-    print("\n".join(report_lines(report)))
+    } | sections
+    try:
+        if settings.output:
+            write_file(Path(settings.output), report_json(report))
+    finally:
+        print("\n".join(report_lines(report)))
     if settings.output:
-        write_file(Path(settings.output), report_json(report))
         print(f"written to {settings.output}")
+    if failure is not None:
+        raise failure
     if settings.checkout and complete:
         take_over(report, Path(settings.checkout))
         print(f"written to docs/speed.json, docs/speed.md and README.md in {settings.checkout}")

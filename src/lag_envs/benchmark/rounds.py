@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from lag_envs.progress import progress
+from lag_envs.workers import stopping_point
 
 #: Takes at least this many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -46,12 +47,14 @@ def measure_rates(
         try:
             for i, row in enumerate(rows):
                 advance(f"{row.library} {row.id} {row.kind} {row.num_envs}")
+                stopping_point()
                 with excused(row):
                     run = row.prepare()
                     runs[i] = run, calibrate(run, seconds, clock)
             for _ in range(rounds):
                 for i, row in enumerate(rows):
                     advance("measuring")
+                    stopping_point()
                     if row.problem is None:
                         with excused(row):
                             row.rates.append(rate(*runs[i], clock) * row.num_envs)

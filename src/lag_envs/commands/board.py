@@ -29,9 +29,7 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
 
         try:
             return getattr(import_module(f"lag_envs.leaderboard.{module}"), function)(given)
-        except (BoardError, Refused, SpreadError, OSError) as error:
-            if isinstance(error, BrokenPipeError):
-                raise
+        except (BoardError, Refused, SpreadError) as error:
             raise UserError(str(error)) from error
 
     return call

@@ -52,7 +52,7 @@ def run_report(args: argparse.Namespace) -> int:
         made = ReportSettings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
         try:
             return 0 if make_report(made) else 130
-        except (NotAReport, OSError) as error:
+        except NotAReport as error:
             raise UserError(str(error)) from error
     names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
     for name in names:
@@ -69,7 +69,7 @@ def run_report(args: argparse.Namespace) -> int:
 
             return docs.main([folder, args.docs])
         return 0
-    except (NotAReport, OSError) as error:
+    except NotAReport as error:
         raise UserError(str(error)) from error
 
 

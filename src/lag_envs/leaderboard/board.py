@@ -135,7 +135,7 @@ class Board:
         Others wait meanwhile. Temporary files left by a kill are removed.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        with locked(self.log) as log:
+        with store.named(self.log), locked(self.log) as log:
             _remove(self.folder / "submissions" / ".new")
             for left in (self.folder / "results").glob("**/.*.part"):
                 _remove(left)

@@ -7,6 +7,7 @@ all of it. The lines of protocol 1 are older than this; the first line with a ha
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -587,7 +588,7 @@ def write_event(log: int, told: dict[str, Any]) -> LogLine:
     line += json.dumps(told, ensure_ascii=False).encode() + b"\n"
     try:
         if os.write(log, line) < len(line):
-            raise OSError("the disk is full")
+            raise OSError(errno.ENOSPC, "the disk is full")
     except OSError:
         os.ftruncate(log, len(content))
         raise
