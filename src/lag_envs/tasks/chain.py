@@ -263,9 +263,9 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in t
     }  # fmt: skip
 
     difficulty = (
-        "As with the strong support, but with half the acceleration on a shorter track: energy has to be "
-        "pumped in over several swings, and this support cannot catch deviations at the top that a strong "
-        "one could."
+        "As with the strong support of DoubleBar-v0, but with half the acceleration on a shorter track: "
+        "energy has to be pumped in over several swings, and this support cannot catch deviations at the top "
+        "that a strong one could."
     )
     note = """
 Planning anew for each start is best. When the board opened, the plans went on far beyond the catch; those
@@ -337,7 +337,7 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
         tried={
             "plan + TVLQR": "the best of 18 plans, followed on the noisy observations",
             "filter + plan + TVLQR": "the same plan, followed on the estimate of an extended Kalman filter "
-            "on the exact model; weight and drift the best of 13 pairs in 96 or 192 episodes each",
+            "on the exact model; of 13 pairs of its weight and drift, the best in 96 or 192 episodes",
             "fast PPO": "5 million steps a seed, without memory",
         },
     )

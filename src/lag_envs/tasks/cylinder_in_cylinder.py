@@ -258,7 +258,7 @@ of their loss comes afterwards: they stop beside the target, while the controlle
 
 
 class Pump(_Shell):
-    """Pump the swing of a cylinder inside a shell to an energy by turning the shell, and keep it there.
+    """Pump a cylinder rolling inside a shell up to a given energy by turning the shell, and keep it there.
 
     ## Description
 
@@ -414,9 +414,9 @@ class Damping(Task):
 
     ## Description
 
-    A solid cylinder rolls without slipping inside a fixed hollow one. The control is a brake: the coefficient
-    of a drag that removes energy. Kicks put energy back. Bring the cylinder to rest at the bottom. Braking
-    as hard as possible is not optimal: it makes the cylinder creep.
+    A solid cylinder rolls without slipping inside a fixed hollow one. The control is a brake: it sets the
+    coefficient of a drag that removes energy. Kicks put energy back. Bring the cylinder to rest at the
+    bottom. Braking as hard as possible is not optimal: it makes the cylinder creep.
 
     ## Action Space
 

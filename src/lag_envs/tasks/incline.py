@@ -287,8 +287,9 @@ class Brake(Task):
 
     ## Description
 
-    A solid cylinder rolls without slipping down a slope of 15°. The control is a brake: the coefficient of a
-    drag. Let the cylinder cross a line soon, at 0.5 m/s or less. Time and excess speed both cost.
+    A solid cylinder rolls without slipping down a slope of 15°. The control is a brake: it sets the
+    coefficient of a drag. Let the cylinder cross a line soon, at 0.5 m/s or less. Time and excess speed both
+    cost.
 
     ## Action Space
 

@@ -265,9 +265,9 @@ class SwingUpUnknown(SwingUp):
 
     ## Description
 
-    The swing-up of `PivotedBar-v0` with a different bar in each episode. The distance of its centre of mass
-    from the pivot and the damping of the pivot are drawn anew and cannot be observed; the bar's
-    moment of inertia follows. Sensors are noisy, and each action takes effect one step late.
+    This is the swing-up of `PivotedBar-v0`, with a different bar in each episode. The distance of its
+    centre of mass from the pivot and the damping of the pivot are drawn anew and cannot be observed; the
+    bar's moment of inertia follows. Sensors are noisy, and each action takes effect one step late.
 
     ## Action Space
 
