@@ -203,6 +203,7 @@ def test_build(run):
     assert any("An agent" in path.read_text(encoding="utf-8") for path in Path("page").glob("*.html"))
     Path("other").mkdir()
     Path("other/index.html").write_text("mine")
+    assert "--url: the page's address must begin with https://" in run("build", "--url", "ftp://a")[2]
     status, _, err = run("build", "other")
     assert status == 2 and "other holds other things, such as index.html; name a new or an empty" in err
     assert os.listdir("other") == ["index.html"] and Path("other/index.html").read_text() == "mine"

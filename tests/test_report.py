@@ -176,6 +176,7 @@ def test_command_line_errors(tmp_path, capsys):
         (["report", str(tmp_path)], "holds other things"),
         (["report", str(tmp_path / "thesis.txt")], "thesis.txt is no folder"),
         (["report", "--sections", "stabilty", str(tmp_path / "new")], "did you mean stability?"),
+        (["report", "--docs", "nowhere", str(tmp_path / "new")], "--docs: nowhere/README.md is missing"),
         (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs needs a whole report"),
         (
             ["report", "--sections", "bound", "--docs", ".", str(tmp_path / "new")],

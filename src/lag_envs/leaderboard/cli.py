@@ -418,10 +418,12 @@ def _pin(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.site.build import MANIFEST, write_page
+    from lag_envs.leaderboard.site.build import MANIFEST, safe_url, write_page
 
     if not args.board.is_dir():
         raise BoardError(f"there is no folder {args.board}; --board names a board's folder")
+    if args.url and not safe_url(args.url):
+        raise BoardError(f"--url: the page's address must begin with https:// or http://, got {args.url!r}")
     found = sorted(path.name for path in args.out.iterdir()) if args.out.is_dir() else []
     foreign = [name for name in found if not name.startswith(".")]  # such as a checkout's .git
     if foreign and MANIFEST not in found:

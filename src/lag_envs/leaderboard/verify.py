@@ -287,7 +287,8 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
         told = ({key: value for key, value in r.items() if key != "folder"} for r in found)
         return {r["digest"]: checked_result(r) for r in told if "refused" not in r}
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"--against: {file} cannot be read: {error}") from error
+        what = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"--against: {file} cannot be read: {what}") from error
 
 
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, plans: bool) -> bool:
