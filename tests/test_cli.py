@@ -111,6 +111,7 @@ def run_stub(body, **options):
     return subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True, **options)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
 def test_sigterm_is_like_ctrl_c():
     body = "try:\n        print('begins', flush=True); time.sleep(60)\n    finally: print('tidies')"
     child = run_stub(body, stdout=subprocess.PIPE)

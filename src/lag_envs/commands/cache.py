@@ -25,7 +25,7 @@ def run_cache(args: argparse.Namespace) -> int:
     if args.clear:
         print(f"{place}: {cache.clear(place)} files removed")
         if left := cache.cache_files(place):
-            raise UserError(f"{len(left)} files cannot be removed, such as {left[0].path}")
+            raise UserError(f"files that cannot be removed: {len(left)}, such as {left[0].path}")
         return 0
     kept = cache.cache_files(place)
     size = sum(entry.size for entry in kept)
