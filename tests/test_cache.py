@@ -166,6 +166,14 @@ def test_without_a_folder_that_can_be_written_to(kind, tmp_path, monkeypatch, ca
     assert main(["cache", "--clear"]) == 0
 
 
+def test_what_cannot_be_removed_is_told(place, monkeypatch, capsys):
+    hits()
+    monkeypatch.setattr(cache, "_remove", lambda path: False)  # as in a folder that may only be read
+    assert main(["cache", "--clear"]) == 2
+    told = capsys.readouterr()
+    assert "0 files removed" in told.out and f"cannot be removed: 1, such as {place}" in told.err
+
+
 def test_a_file_that_may_not_be_read(place):
     hits()
     (path,) = files(place)

@@ -100,6 +100,41 @@ def test_every_module_that_is_run_has_help_with_examples(module, capsys):
     assert re.search(rf"^  {run.removesuffix('.__main__')}\b", capsys.readouterr().out, re.M)
 
 
+# --- errors and signals ---
+
+
+def run_stub(body, **options):
+    """Start a process whose command `list` does something else."""
+    script = f"import os, sys, time\nfrom lag_envs import cli\ndef run(args):\n    {body}\n"
+    script += "cli.COMMANDS = [command._replace(run=run) for command in cli.COMMANDS]\n"
+    script += "sys.exit(cli.main(['list']))"
+    return subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True, **options)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_sigterm_is_like_ctrl_c():
+    body = "try:\n        print('begins', flush=True); time.sleep(60)\n    finally: print('tidies')"
+    child = run_stub(body, stdout=subprocess.PIPE)
+    assert child.stdout.readline() == "begins\n"
+    child.terminate()
+    assert child.communicate(timeout=60) == ("tidies\n", "") and child.returncode == 130
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("text", ["a", "a" * 100_000])
+def test_a_full_output_is_told_in_a_line(text):
+    with open("/dev/full", "w") as full:
+        child = run_stub(f"print({text!r})", stdout=full)
+        told = child.communicate(timeout=60)[1]
+    assert (told, child.returncode) == ("lag-envs: error: No space left on device\n", 1)
+
+
+def test_what_the_system_refuses_is_told_in_a_line(tmp_path):
+    child = run_stub(f"print('so far'); open({str(tmp_path)!r})", stdout=subprocess.PIPE)
+    assert child.communicate(timeout=60) == ("so far\n", f"lag-envs: error: {tmp_path}: Is a directory\n")
+    assert child.returncode == 1
+
+
 # --- list, info ---
 
 

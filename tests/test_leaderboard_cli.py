@@ -112,6 +112,26 @@ def test_the_same_command_goes_on_after_a_kill(run):
     assert run("add", "a", "--nonce", "n")[:2] == (0, f"{ids()[0]}: is there already, verified\n")
 
 
+@pytest.mark.parametrize(
+    ("action", "again"),
+    [
+        (("add", "a", "--nonce", "n"), "the same command"),
+        (("nonce", "n"), "`lag-envs leaderboard add --board 'my board'`"),
+    ],
+)
+def test_ctrl_c_tells_how_to_go_on(run, monkeypatch, action, again):
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    write("a")
+    run("add", "a", "--board", "my board")
+    with monkeypatch.context() as patched:
+        patched.setattr("lag_envs.leaderboard.cli.finish", interrupted)
+        status, _, err = run(*action, "--board", "my board")
+    assert status == 130 and err.endswith(f"interrupted; what is done is kept, {again} goes on\n")
+    assert run("add", "--board", "my board")[1].endswith(": verified\n")
+
+
 def test_add_without_a_folder_goes_on(run):
     write("a")
     run("add", "a")
@@ -177,12 +197,16 @@ def test_other_commands_do_not_load_the_leaderboard():
 def test_build(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")
+    Path("page/.git").mkdir(parents=True)  # as in a checkout
     status, out, _ = run("build", "page")
     assert status == 0 and out == f"{Path('page/index.html')}\n"
     assert any("An agent" in path.read_text(encoding="utf-8") for path in Path("page").glob("*.html"))
     Path("other").mkdir()
     Path("other/index.html").write_text("mine")
-    assert run("build", "other")[0] == 2 and Path("other/index.html").read_text() == "mine"
+    assert "--url: the page's address must begin with https://" in run("build", "--url", "ftp://a")[2]
+    status, _, err = run("build", "other")
+    assert status == 2 and "other holds other things, such as index.html; name a new or an empty" in err
+    assert os.listdir("other") == ["index.html"] and Path("other/index.html").read_text() == "mine"
 
 
 @pytest.mark.slow

@@ -90,7 +90,8 @@ def test_timings_run_alone(tmp_path):
     assert len(results) == 3
 
 
-def test_interrupt_keeps_what_is_finished(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_interrupt_keeps_what_is_finished(tmp_path, number):
     code = (
         "from tests.dummy_section import job\n"
         "from lag_envs.report.runner import run_jobs\n"
@@ -113,8 +114,10 @@ def test_interrupt_keeps_what_is_finished(tmp_path):
     end = time.monotonic() + 60
     while time.monotonic() < end and not (file.exists() and load_results(file)):
         time.sleep(0.1)
-    child.send_signal(signal.SIGINT)
-    assert child.communicate(timeout=30)[0].split() == ["1", "False"]
+    child.send_signal(number)
+    told = child.communicate(timeout=30)[0].split()
+    assert told == (["1", "False"] if number == signal.SIGINT else [])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["references", "results.jsonl", "script.py"]
     assert [r.name for r in load_results(file)] == ["works"]
 
 
@@ -171,8 +174,9 @@ def test_command_line_errors(tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("mine")
     for arguments, message in (
         (["report", str(tmp_path)], "holds other things"),
-        (["report", str(tmp_path / "thesis.txt")], "thesis.txt"),
+        (["report", str(tmp_path / "thesis.txt")], "thesis.txt is no folder"),
         (["report", "--sections", "stabilty", str(tmp_path / "new")], "did you mean stability?"),
+        (["report", "--docs", "nowhere", str(tmp_path / "new")], "--docs: nowhere/README.md is missing"),
         (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs needs a whole report"),
         (
             ["report", "--sections", "bound", "--docs", ".", str(tmp_path / "new")],

@@ -315,6 +315,22 @@ def command(*arguments):
     return run_verify(parser.parse_args([str(a) for a in arguments]))
 
 
+@pytest.mark.parametrize("end", [KeyboardInterrupt, MemoryError])
+def test_what_ends_the_command_leaves_the_results_so_far(end, tmp_path, capsys, monkeypatch):
+    def some(folders, args):
+        yield folders[1], {"refused": "why"}
+        raise end
+
+    monkeypatch.setattr("lag_envs.leaderboard.verify._results", some)
+    with pytest.raises(end):
+        command("a b", "c", "d", "--json", tmp_path / "out.json")
+    assert json.loads((tmp_path / "out.json").read_text()) == [{"folder": "c", "refused": "why"}]
+    told = capsys.readouterr()
+    assert told.out == "c: refused: why\n"
+    left = "interrupted; left to verify, with another --json: 'a b' d\n"
+    assert told.err == (left if end is KeyboardInterrupt else "")
+
+
 def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     feedback(tmp_path / "good")
     feedback(tmp_path / "bad")

@@ -39,7 +39,6 @@ def run_shown(program: str, run: Callable[[], int]) -> int:
                 sys.stdout.flush()
             except OSError:
                 _drop_output()
-                error.filename = error.filename or "standard output"
             print(f"{program}: error: {reason(error)}", file=sys.stderr)
             return 1
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable
 from datetime import date
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from lag_envs import TASKS
@@ -41,6 +43,13 @@ def needs(extra: str, *packages: str) -> None:
     for package in packages:
         if find_spec(package) is None:
             raise UserError(f'{package} is missing: pip install "lag-envs[{extra}]"')
+
+
+def check_checkout(option: str, folder: str) -> None:
+    """Raise a UserError before anything is measured, if the checkout that an option names is none."""
+    for name in ("README.md", "docs/speed.json", "docs/speed.md"):
+        if not os.access(Path(folder, name), os.W_OK):
+            raise UserError(f"{option}: {Path(folder, name)} is missing, or cannot be written to")
 
 
 def declare_date(parser: argparse.ArgumentParser, where: str) -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, declare_date, known_id, needs, seconds
+from lag_envs.commands.base import OWN, Command, check_checkout, count, declare_date, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.options import new_file
@@ -96,11 +94,7 @@ def run_bench(args: argparse.Namespace) -> int:
                 "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes, --with, "
                 "--threads"
             )
-        for name in ("README.md", "docs/speed.json", "docs/speed.md"):
-            if not os.access(Path(args.checkout, name), os.W_OK):
-                raise UserError(
-                    f"--checkout: {Path(args.checkout, name)} is missing, or cannot be written to"
-                )
+        check_checkout("--checkout", args.checkout)
     if args.threads > (cores := usable_cores()):
         raise UserError(f"--threads {args.threads} needs as many cores; this process may use {cores}")
     if args.threads > 1 and args.clock == "cpu":
@@ -195,7 +189,8 @@ BENCH = Command(
     "compare the speed with other libraries",
     """Compare steps per second with Gymnasium and, if installed, EnvPool, gymnax and TorchRL, in one
 run on one core: each round takes a sample of every row, and ratios are taken within a round. Then time
-the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so far.
+the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so far; a second one
+ends it at once, without them.
 
 examples:
   lag-envs bench --quick                             one environment, under a minute

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lag_envs.commands.base import Command
+from lag_envs.errors import UserError
 from lag_envs.tables import aligned
 
 
@@ -23,6 +24,8 @@ def run_cache(args: argparse.Namespace) -> int:
         return 0
     if args.clear:
         print(f"{place}: {cache.clear(place)} files removed")
+        if left := cache.cache_files(place):
+            raise UserError(f"files that cannot be removed: {len(left)}, such as {left[0].path}")
         return 0
     kept = cache.cache_files(place)
     size = sum(entry.size for entry in kept)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from lag_envs.commands.base import OWN, Command, count, declare_date, needs
+from lag_envs.commands.base import OWN, Command, check_checkout, count, declare_date, needs
 from lag_envs.errors import UserError, hint
 from lag_envs.own_files import is_file
 
@@ -60,6 +60,8 @@ def run_report(args: argparse.Namespace) -> int:
             raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     if args.docs and (args.quick or names != SECTIONS):
         raise UserError("--docs needs a whole report: leave out --quick and --sections")
+    if args.docs:
+        check_checkout("--docs", args.docs)
     settings = ReportSettings(folder, args.quick, names, args.processes, args.date)
     try:
         if not make_report(settings):

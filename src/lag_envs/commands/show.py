@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from lag_envs import TASKS
 from lag_envs.commands.base import OWN, Command, count, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.own_files import is_file
+from lag_envs.store import named
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -80,7 +82,8 @@ def run_watch(args: argparse.Namespace) -> int:
         seed = secrets.randbelow(2**31) if args.seed is None else args.seed
         print(f"{id}: {name}", flush=True)
         limits = {"episodes": args.episodes, "steps": args.steps, "video": args.video}
-        watch.watch(id, agent, seed=seed, **limits, **_look(args))
+        with nullcontext() if args.video is None else named(args.video):
+            watch.watch(id, agent, seed=seed, **limits, **_look(args))
         if args.video is not None:
             print(f"{args.video} is written")
     except ValueError as error:

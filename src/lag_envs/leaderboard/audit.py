@@ -180,7 +180,8 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
         found.open = "there is none"
         return found
     except (OSError, ValueError) as error:
-        found.wrong.append(f"{path} is no pin: {error}; {REMEDY}")
+        told = error.strerror if isinstance(error, OSError) else error
+        found.wrong.append(f"{path} is no pin: {told}; {REMEDY}")
         return found
     lines = log.split(b"\n")
     if file is None and hashlib.sha256(lines[0] + b"\n").hexdigest() != pin.board:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -143,7 +144,14 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
 
 def run_leaderboard(args: argparse.Namespace) -> int:
     """Run the requested action; raise a BoardError or SpreadError if it fails."""
-    return args.act(args)
+    try:
+        return args.act(args)
+    except KeyboardInterrupt:
+        if args.action in ("add", "nonce"):
+            board = "" if args.board == Path("leaderboard") else f" --board {shlex.quote(str(args.board))}"
+            again = "the same command" if args.action == "add" else f"`lag-envs leaderboard add{board}`"
+            print(f"interrupted; what is done is kept, {again} goes on", file=sys.stderr)
+        raise
 
 
 def _positive(text: str) -> int:
@@ -164,7 +172,7 @@ def _add(args: argparse.Namespace) -> int:
     for folder in args.folders:
         try:
             entry = board.add(load(folder))
-        except (Refused, BoardError, OSError) as error:
+        except (Refused, BoardError) as error:
             failed += 1
             print(f"{ascii_text(folder)}: refused: {error}", file=sys.stderr)
             continue
@@ -410,10 +418,18 @@ def _pin(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.site.build import write_page
+    from lag_envs.leaderboard.site.build import MANIFEST, safe_url, write_page
 
     if not args.board.is_dir():
         raise BoardError(f"there is no folder {args.board}; --board names a board's folder")
+    if args.url and not safe_url(args.url):
+        raise BoardError(f"--url: the page's address must begin with https:// or http://, got {args.url!r}")
+    found = sorted(path.name for path in args.out.iterdir()) if args.out.is_dir() else []
+    foreign = [name for name in found if not name.startswith(".")]  # such as a checkout's .git
+    if foreign and MANIFEST not in found:
+        raise BoardError(
+            f"{args.out} holds other things, such as {foreign[0]}; name a new or an empty folder"
+        )
     write_page(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0

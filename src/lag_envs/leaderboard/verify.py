@@ -6,6 +6,8 @@ import argparse
 import hashlib
 import json
 import platform
+import shlex
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -253,17 +255,26 @@ def run_verify(args: argparse.Namespace) -> int:
         raise UserError(f"--jobs must be at least 1, got {args.jobs}")
     folders = [Path(folder) for folder in args.folders]
     before = _read(Path(args.against)) if args.against else None
-    results, far = [], False
-    for folder, result in _results(folders, args):
-        if isinstance(result, Exception):
-            raise result
-        results.append({"folder": str(folder)} | result)
-        print("\n".join(result_lines(results[-1])), flush=True)
-        if before is not None and "refused" not in result:
-            plans = load(folder).architecture.plans
-            far |= _report(result, before.get(result["digest"]), args.against, plans)
-    if args.json:
-        write_file(args.json, json.dumps(results, allow_nan=False) + "\n")
+    results: list[dict[str, Any]] = []
+    far = False
+    try:
+        for folder, result in _results(folders, args):
+            if isinstance(result, Exception):
+                raise result
+            results.append({"folder": str(folder)} | result)
+            print("\n".join(result_lines(results[-1])), flush=True)
+            if before is not None and "refused" not in result:
+                plans = load(folder).architecture.plans
+                far |= _report(result, before.get(result["digest"]), args.against, plans)
+    except KeyboardInterrupt:
+        done = [result["folder"] for result in results]
+        rest = [folder for folder in map(str, folders) if folder not in done]
+        other = ", with another --json" if args.json and results else ""
+        print(f"interrupted; left to verify{other}: {shlex.join(rest)}", file=sys.stderr)
+        raise
+    finally:  # also after an error
+        if args.json and results:
+            write_file(args.json, json.dumps(results, allow_nan=False) + "\n")
     return 1 if far or any("refused" in result for result in results) else 0
 
 
@@ -276,7 +287,8 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
         told = ({key: value for key, value in r.items() if key != "folder"} for r in found)
         return {r["digest"]: checked_result(r) for r in told if "refused" not in r}
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"--against: {file} cannot be read: {error}") from error
+        what = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"--against: {file} cannot be read: {what}") from error
 
 
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, plans: bool) -> bool:

@@ -148,7 +148,7 @@ def load_results(file: Path) -> list[JobResult]:
 
 def _in_processes(jobs: Sequence[ReportJob], folder: Path, count: int) -> Iterator[JobResult]:
     with (
-        TemporaryDirectory(dir=folder, prefix="rows-") as rows,
+        TemporaryDirectory() as rows,
         processes(count, _begin, str(folder)) as submit,
     ):
         futures = {}
