@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
+from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import render, write_page
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
@@ -239,10 +240,10 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
 
 def test_a_folder_with_other_files_is_refused(data, tmp_path):
     (tmp_path / "index.html").write_text("mine")
-    with pytest.raises(FileExistsError, match="not a leaderboard's"):
+    with pytest.raises(BoardError, match="holds other things, such as index.html"):
         write_page(data, tmp_path)
     (tmp_path / "site.json").write_text("{")
-    with pytest.raises(FileExistsError, match="cannot be read"):
+    with pytest.raises(BoardError, match="cannot be read"):
         write_page(data, tmp_path)
     (tmp_path / "site.json").write_text('{"files": ["../precious.html", "index.html"]}')
     (tmp_path.parent / "precious.html").write_text("mine")

@@ -1,4 +1,4 @@
-"""The options of modules that are run."""
+"""Parsers of modules that are run, and types of arguments."""
 
 from __future__ import annotations
 
@@ -19,6 +19,13 @@ def module_parser(module: str, about: str | None, examples: str, **options: Any)
         formatter_class=argparse.RawDescriptionHelpFormatter,
         **options,
     )
+
+
+def count(text: str) -> int:
+    """Return an argument as a positive integer."""
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
+    return int(text)
 
 
 def new_file(text: str) -> Path:

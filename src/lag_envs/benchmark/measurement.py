@@ -93,13 +93,14 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         "speedups": speedups(rows),
         "arithmetic": arithmetic(rows),
     } | sections
+    output = Path(settings.output) if settings.output and any(row.rates for row in rows) else None
     try:
-        if settings.output:
-            write_file(Path(settings.output), report_json(report))
+        if output:
+            write_file(output, report_json(report))
     finally:
         print("\n".join(report_lines(report)))
-    if settings.output:
-        print(f"written to {settings.output}")
+    if output:
+        print(f"written to {output}")
     if failure is not None:
         raise failure
     if settings.checkout and complete:

@@ -58,13 +58,6 @@ def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
     parser.add_argument("--date", default=today, help=f"date to note {where} (default: today)")
 
 
-def count(text: str) -> int:
-    """Return an argument as a positive integer."""
-    if not text.strip().isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
-    return int(text)
-
-
 def seconds(text: str) -> float:
     """Return an argument as a time [s]."""
     try:

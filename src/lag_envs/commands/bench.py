@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Sequence
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, check_checkout, count, declare_date, known_id, needs, seconds
+from lag_envs.commands.base import OWN, Command, check_checkout, declare_date, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
-from lag_envs.options import new_file
+from lag_envs.options import count, new_file
 from lag_envs.own_files import is_file
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, known_id
+from lag_envs.commands.base import OWN, Command, known_id
+from lag_envs.options import count
 from lag_envs.own_files import is_file
 from lag_envs.scenes.derivation import order_of
 

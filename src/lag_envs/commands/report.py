@@ -7,8 +7,9 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from lag_envs.commands.base import OWN, Command, check_checkout, count, declare_date, needs
+from lag_envs.commands.base import OWN, Command, check_checkout, declare_date, needs
 from lag_envs.errors import UserError, hint
+from lag_envs.options import count
 from lag_envs.own_files import is_file
 
 

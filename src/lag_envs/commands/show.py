@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, known_id, needs, seconds
+from lag_envs.commands.base import OWN, Command, known_id, needs, seconds
 from lag_envs.errors import UserError
+from lag_envs.options import count
 from lag_envs.own_files import is_file
 from lag_envs.store import named
 

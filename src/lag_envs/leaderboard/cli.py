@@ -24,6 +24,7 @@ from lag_envs.leaderboard.log import (
 )
 from lag_envs.leaderboard.pending import PendingCheck, finish
 from lag_envs.leaderboard.standings import board_data, page_data
+from lag_envs.options import count
 from lag_envs.tables import aligned
 
 #: Examples of each action, the simplest use first.
@@ -78,7 +79,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         one.add_argument(
             "--jobs",
             metavar="N",
-            type=_positive,
+            type=count,
             default=os.cpu_count() or 1,
             help="submissions verified side by side (default: one per core)",
         )
@@ -109,7 +110,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one.add_argument("id", metavar="ID", help="as `list` shows it")
     one.add_argument("--json", action="store_true", help="as JSON, with curves, profile and replays")
     one.add_argument(
-        "--protocol", metavar="N", type=_positive, help="on the board of this protocol (default: the current)"
+        "--protocol", metavar="N", type=count, help="on the board of this protocol (default: the current)"
     )
     one = action("withdraw", "take a submission off the board", _withdraw)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
@@ -152,12 +153,6 @@ def run_leaderboard(args: argparse.Namespace) -> int:
             again = "the same command" if args.action == "add" else f"`lag-envs leaderboard add{board}`"
             print(f"interrupted; what is done is kept, {again} goes on", file=sys.stderr)
         raise
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
-    return int(text)
 
 
 # --- add, nonce ---------------------------------------------------------------------------------------------
@@ -418,18 +413,12 @@ def _pin(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.site.build import MANIFEST, safe_url, write_page
+    from lag_envs.leaderboard.site.build import safe_url, write_page
 
     if not args.board.is_dir():
         raise BoardError(f"there is no folder {args.board}; --board names a board's folder")
     if args.url and not safe_url(args.url):
         raise BoardError(f"--url: the page's address must begin with https:// or http://, got {args.url!r}")
-    found = sorted(path.name for path in args.out.iterdir()) if args.out.is_dir() else []
-    foreign = [name for name in found if not name.startswith(".")]  # such as a checkout's .git
-    if foreign and MANIFEST not in found:
-        raise BoardError(
-            f"{args.out} holds other things, such as {foreign[0]}; name a new or an empty folder"
-        )
     write_page(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0

@@ -20,6 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from lag_envs import store
+from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import driving
 from lag_envs.leaderboard.site.scenery import Scenery, scenery_data
 
@@ -116,8 +117,8 @@ def write_page(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     ------
     ValueError
         If the address is not http or https.
-    FileExistsError
-        If the folder holds an ``index.html`` that no earlier build wrote.
+    BoardError
+        If the folder holds files, and none of them says that an earlier build wrote them.
     NotADirectoryError, OSError
         If the folder cannot be written.
     """
@@ -501,10 +502,12 @@ def _manifest(out: Path) -> set[str]:
         # A manifest that somebody wrote by hand must not remove files elsewhere.
         return {n for n in names if re.fullmatch(r"(assets/)?[\w-]+\.(html|css|js|png|xml)", n)}
     except FileNotFoundError:
-        if (out / "index.html").exists():
-            raise FileExistsError(
-                f"{out} holds an index.html that is not a leaderboard's: name another folder, or empty it"
+        found = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+        foreign = [name for name in found if not name.startswith(".")]  # such as a checkout's .git
+        if foreign:
+            raise BoardError(
+                f"{out} holds other things, such as {foreign[0]}; name a new or an empty folder"
             ) from None
         return set()
     except (ValueError, KeyError, TypeError) as error:
-        raise FileExistsError(f"{out / MANIFEST} cannot be read ({error}): remove the folder") from error
+        raise BoardError(f"{out / MANIFEST} cannot be read ({error}); remove the folder") from error
