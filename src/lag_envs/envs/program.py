@@ -67,6 +67,11 @@ class Program:
     reaching: Sequence[str] = ()
     #: Whether a batch has a loop after the step for what the sensors show.
     sensing = False
+    #: Where actuators lag, the rows ``u`` keep the controls in force; these are their names at a step's start
+    #: and end. In between ``u`` are the commands, and from the lines `behind` on the means over the step.
+    in_force: Sequence[str] = ()
+    in_force_after: Sequence[str] = ()
+    behind: Sequence[str] = ()
 
     def __init__(
         self,
@@ -77,7 +82,8 @@ class Program:
     ) -> None:
         formulas = task.formulas
         names = names or list(formulas.constants())
-        self._stepper = formulas.stepper(absent)
+        constants = {name: 0.0 if name in absent else f"k_{name}" for name in names}
+        self._stepper = self._step_code(formulas, absent, constants)
         #: Whether steps use the general series, block by block, instead of a flow, lane by lane.
         self.general = not hasattr(self._stepper, "fast")
         if max(formulas.draws, len(formulas.state) + formulas.targets) > DRAWS:
@@ -87,7 +93,7 @@ class Program:
         self.a = [f"a{i}" for i in range(formulas.actions)]
         self.u = [f"u{i}" for i in range(formulas.controls)]
         self.g = [f"g{i}" for i in range(formulas.targets)]
-        self._record(formulas, {name: 0.0 if name in absent else f"k_{name}" for name in names})
+        self._record(formulas, constants)
         lines = " ".join(self._printed)
         used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", lines)}
         #: Names of the constants that are carried: those that are used and not zero.
@@ -103,6 +109,10 @@ class Program:
             *self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held, *self.reaching,
             *(["clock"] if self.sensing else []),
         ]  # fmt: skip
+
+    def _step_code(self, formulas: Any, absent: frozenset[str], constants: dict[str, Any]) -> Any:
+        """Return the code of a step of the scene."""
+        return formulas.stepper(absent)
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         width, actions, controls, targets = len(self.y), len(self.a), len(self.u), len(self.g)
@@ -189,10 +199,11 @@ class Program:
         """
         body = [
             *self._constants_one(), *self._one.load([*self.y, *self.g, *self.reached, "n"]),
+            *self._one.load(self.u[: len(self.in_force)], self.in_force),
             *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
-            *self._command_one, *self._controls, *self.fast, *self._advance_one, *self._one.store(self.u),
-            *self._finish_one(),
+            *self._command_one, *self._controls, *self.fast, *self._advance_one, *self.behind,
+            *self._one.store(self.u, self.in_force_after or self.u), *self._finish_one(),
         ]  # fmt: skip
         helpers = [self._stepper.engine()] if self.general else []
         return compiled_lines("step_one", "f, obs, a, ids", body, *helpers)
@@ -210,6 +221,11 @@ class Program:
             f"rows, order = f[{first}:], {self._x}", *self._stepper.any_step,
             "if status < 0:", *indent(slow),
         ]  # fmt: skip
+
+    @property
+    def tries_all(self) -> bool:
+        """Whether a step that `step_one` does not take is refused, rather than left to `advance`."""
+        return self.general
 
     @cached_property
     def finish_one(self) -> Callable:
@@ -359,25 +375,31 @@ class Program:
         counted = ["clock = n"] if self.sensing else []
         key = [self._key] if self.kick else []
         controls = [*self._load(self.a), *self._controls]
+        present = self._load(self.u[: len(self.in_force)], self.in_force)
+        ends = list(zip(self.in_force, self.in_force_after, strict=True))
         if self.general:
             rows = dict(zip(self._stepper.rows, self.flow, strict=True))
+            commands = self.held if self.in_force else self.u
+            given = [*self._load(commands, self.u), *present, *self.fast]
             # The status of a lane shows that it is to be restarted, not stepped.
             before = [
-                *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
-                *self._store([*self.u, *self.reaching]),
+                *inputs, *controls, *present, *self._stepper.prepare,
+                "status = select(n < 0.0, -1.0, 0.0)",
+                *self._store([*commands, *self.reaching], [*self.u, *self.reaching]),
                 *self._store([rows[name] for name in self._stepper.given], self._stepper.given),
             ]  # fmt: skip
             after = self._load([rows[name] for name in self._stepper.results], self._stepper.results)
             start, dt = f"np.int64({len(self.uniform)})", "k_dt"
             call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
             moving = [*indented(lane, before), call]
-            move = [*self._load(self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
-            again = [*self._load(self.u), *self.fast, *after, *self._stepper.finish]
+            again = [*given, *after, *self._stepper.finish, *self.behind]
+            move = [*again, "within = status > 0.0"]
             helpers = [self._stepper.compile_block()]
         else:
             moving, move = [], [*controls, *self.fast]
             again = [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
             helpers = [self._stepper.engine()]
+        refused = [*self._load(self.held, self.u), *self._store(self.u)] if self.in_force else []
         # If the fast formula does not hold, or the last reward is special, the start is kept for another try.
         holds = "within and not over > 0.0" if self.last else "within"
         main = [
@@ -387,7 +409,9 @@ class Program:
             "n = n + 1.0", *counted, "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
+            *(f"{start} = select(plain, {end}, {start})" for start, end in ends),
             *self.observe, *self._store([*y, *([] if self.general else [*self.u, *self.reaching])]),
+            *self._store(self.u[: len(ends)], self.in_force),
             *self._store([*results, "ordinary"]),
         ]  # fmt: skip
         special = [
@@ -397,7 +421,7 @@ class Program:
                 *inputs, *again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
-                *indent(self._store(["over"], ["0.0"])),
+                *indent([*self._store(["over"], ["0.0"]), *refused]),
                 "else:",
                 *indent([
                     *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
@@ -405,7 +429,7 @@ class Program:
                     "if n >= k_limit:", "    over = over + 2.0",
                     *key, *self.kick, *self.move, *self.observe,
                     "if over > 0.0:", "    n = -over",
-                    *self._store([*y, *results]),
+                    *self._store([*y, *self.u[: len(ends)], *results], [*y, *self.in_force_after, *results]),
                     *(self._store(["ordinary"], ["1.0"]) if self.sensing else []),
                 ]),
             ]),

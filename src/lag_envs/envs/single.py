@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.imperfect.divided import DividedProgram
 from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.interface import (
@@ -358,14 +357,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
         held = self._read(program.held)
-        if isinstance(program, DividedProgram):  # it has tried everything
+        if program.tries_all:
             raise self._refusal(held)
         constants = numbers_of(self.task)
         constants |= {name: rows[self._row[f"k_{name}"]] for name in program.varying}
-        start = [*([np.zeros(program.room)] if program.general else []), *self._read(program.y), *held]
-        *end, status = program.advance(
-            *start, self.task.dt, constants["x"], *(constants[n] for n in program.advance_constants)
-        )
+        numbers = (constants[name] for name in program.advance_constants)
+        *end, status = program.advance(*self._read(program.y), *held, self.task.dt, constants["x"], *numbers)
         if status < 0:
             raise self._refusal(held)
         for name, value in zip(program.u, held, strict=True):

@@ -139,7 +139,7 @@ class Imperfections:
     def whole(self) -> bool:
         """Whether commands change, and observations are taken, at the ends of control steps only."""
         shortest, longest = self.action_delay
-        return not (self.lag or self.within or shortest < longest or longest % 1.0)
+        return not (self.within or shortest < longest or longest % 1.0)
 
     @property
     def structure(self) -> tuple:

@@ -2,7 +2,8 @@
 
 docs/usage.md explains the keywords; `lag_envs.tasks.imperfections` checks them. Drawn parameters are rows of
 a batch, like parameters that differ within any batch (`drawn`). Noise, pushes, slew and delays of whole
-control steps change the command before a step and what is shown after it, in loops of their own (`whole`).
+control steps change the command before a step and what is shown after it, in loops of their own (`whole`);
+with a lag the step between is that of `lagged`.
 
 With other imperfections (`divided`) one function takes a control step on the rows of one environment. The
 single environment calls it on its own rows, a batch on those of each environment in turn, so both have the

@@ -62,6 +62,11 @@ class DividedProgram(DrawnProgram):
             *self.own, *actuators.reached, *sensors.shown, *actuators.ring.names, *sensors.ring.names,
         ]  # fmt: skip
 
+    @property
+    def tries_all(self) -> bool:
+        """See `Program.tries_all`."""
+        return True
+
     def _bound_observations(self) -> None:
         """Leave observations unbounded: what the sensors show is bounded later."""
 

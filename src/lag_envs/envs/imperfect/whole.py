@@ -6,6 +6,7 @@ from typing import Any
 
 from lag_envs.envs.imperfect.actuators import Actuators
 from lag_envs.envs.imperfect.drawn import DrawnProgram
+from lag_envs.envs.imperfect.lagged import LaggedCode
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import indent, indented
@@ -30,11 +31,22 @@ class WholeProgram(DrawnProgram):
     @property
     def _printed(self) -> list[str]:
         parts = (self._actuators.perturb, self._actuators.at_rest, self._controls, self._sensors.sense)
-        return [*super()._printed, *(line for part in parts for line in part), self._sensors.due]
+        lag = [self._x, *self._stepper.any_step, *self._stepper.prepare] if self.options.lag else []
+        return [*super()._printed, *(line for part in parts for line in part), self._sensors.due, *lag]
+
+    def _step_code(self, formulas: Any, absent: frozenset[str], constants: dict[str, Any]) -> Any:
+        held = super()._step_code(formulas, absent, constants)
+        if not self.options.lag:
+            return held
+        code = LaggedCode(self._source.scene, held.start, held.end, formulas.lift("z"), constants)
+        self.in_force, self.in_force_after, self.behind = code.in_force, code.in_force_after, code.behind
+        return code
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         super()._record(formulas, constants)
         found = self.options
+        if found.lag:
+            self._x, self.fast = constants["lagged_order"], [f"dt = {constants['dt']}"]
         sensors = Sensors(found, self.o, self.observe, self._bounded, constants, formulas.trace)
         actuators = Actuators(found, formulas, self.a, self.y, self.u, self.clip, constants)
         self._sensors, self._actuators = sensors, actuators
