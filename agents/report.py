@@ -41,7 +41,7 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     parts = [
         "# Agents: what they reach",
         "Made by `python -m agents.results` from `agents/results/summary.json`; do not edit it by hand.",
-        _reading(data),
+        _reading(),
     ]
     for env_id, env in envs.items():
         parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else [])]
@@ -93,7 +93,7 @@ def summary_table(data: Data) -> str:
     return markdown_table(head, rows)
 
 
-def _reading(data: Data) -> str:
+def _reading() -> str:
     return (
         "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best known"
         " policy, which need not be optimal. If no range is known, the tables show the return itself."

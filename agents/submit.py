@@ -88,9 +88,7 @@ def tabulate(solution: Solution) -> tuple[dict[str, Any], dict[str, Array]]:
     return policy, arrays | {"table": values.astype(np.float32)}
 
 
-def optimal(
-    env_id: str, folder: Path, cache: Path | None = DEFAULT_FOLDER, solution: Solution | None = None
-) -> Submission:
+def optimal(env_id: str, folder: Path, cache: Path | None = DEFAULT_FOLDER) -> Submission:
     """Write the optimal policy of an environment as a submission.
 
     Parameters
@@ -101,10 +99,8 @@ def optimal(
         Destination; must not exist.
     cache : Path, optional
         Cache of `agents.optimum`; missing values are computed.
-    solution : Solution, optional
-        An existing solution, instead.
     """
-    solution = solution or Solution(env_id, solvable()[env_id].levels[-1], cache)
+    solution = Solution(env_id, solvable()[env_id].levels[-1], cache)
     policy, arrays = tabulate(solution)
     sizes = " x ".join(map(str, solution.programs[0].grid.shape))
     return write(

@@ -131,13 +131,11 @@ class Sensor:
         Standard deviation of Gaussian noise, drawn independently for each entry at each step.
     late : bool
         Whether the agent sees the previous observation; at the start it sees the first.
-    seed : int
-        Seed of the noise.
     """
 
-    def __init__(self, noise: ArrayLike = 0.0, late: bool = False, seed: int = 0) -> None:
+    def __init__(self, noise: ArrayLike = 0.0, late: bool = False) -> None:
         self.noise, self.late = np.asarray(noise, np.float64), late
-        self.rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng(0)  # the same for all agents
         self.before: NDArray | None = None
 
     def __call__(self, observation: NDArray) -> NDArray:

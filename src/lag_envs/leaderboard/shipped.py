@@ -47,9 +47,9 @@ class Shipped(NamedTuple):
     policy: Mapping[str, Any]
 
 
-def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
+def shipped() -> dict[str, Shipped]:
     """Return the shipped policies, by environment."""
-    found = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+    found = json.loads((FOLDER / INDEX).read_text(encoding="utf-8"))
     return {env_id: Shipped(**entry) for env_id, entry in found.items()}
 
 
