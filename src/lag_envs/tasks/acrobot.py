@@ -20,6 +20,9 @@ _ANGLES = {
     "cos(theta_2)": ("1", "cosine of the second link's angle against the first, 1 straight"),
     "sin(theta_2)": ("1", "its sine"),
 }
+#: For learners with a replay buffer on the real machines: a step is short and pays at most 0.02, so noise is
+#: held for 0.05 s, and eight steps count together.
+_PATIENT = {"n_timesteps": 3e5, "n_steps": 8, "gamma": 0.995}
 
 
 class AcrobotExact(Task):
@@ -291,15 +294,17 @@ class AcrobotReal(Task):
             "n_timesteps": 5e5, "n_steps": 256, "batch_size": 2048, "gamma": 0.998, "gae_lambda": 0.95,
             "reward_scale": 1.0, "noise_steps": 25,
         },
-        # A step is short and pays at most 0.02: noise is held for 0.05 s, and eight steps count together.
         "off_policy": {
-            "n_timesteps": 3e5, "n_steps": 8, "gradient_steps": 2, "gamma": 0.995,
-            "learning_rate": "lin_1e-3", "policy_kwargs": {"net_arch": [64, 64], "noise_steps": 25},
-            "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 30.0}}],
+            "n_timesteps": 2e5, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_1e-3",
+            "policy_kwargs": {"net_arch": [128, 128], "noise_steps": 4},
+        },
+        "sac": {
+            **_PATIENT, "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 30.0}}],
+            "policy_kwargs": {"net_arch": [64, 64], "noise_steps": 25},
         },
         "td3": {
-            "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 10.0}}],
-            "policy_kwargs": {"noise": 0.5},
+            **_PATIENT, "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 10.0}}],
+            "policy_kwargs": {"net_arch": [64, 64], "noise_steps": 25, "noise": 0.5},
         },
     }  # fmt: skip
     examples = Examples(
