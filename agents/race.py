@@ -126,7 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 show(rows)
                 print(f"{learner_label(row['algo'])}, seed {row['seed']}: {told(row)}", flush=True)
     except KeyboardInterrupt:
-        kept = " What was finished is kept; re-run the command to resume." if args.output and rows else ""
+        some = args.output and any("failed" not in row for row in rows)
+        kept = " What was finished is kept; re-run the command to resume." if some else ""
         print(f"\nStopped.{kept}", file=sys.stderr)
         return 130
     finally:

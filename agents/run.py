@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -239,7 +240,7 @@ def known_name(kind: str, name: str, known: Iterable[str]) -> str:
 
 
 def check_numbers(args: argparse.Namespace, **least: int) -> None:
-    """Raise a UserError for a number among the options that is too small, or too large for a seed."""
+    """Raise a UserError for an option that does not lie between its least value and 2³¹ - 1."""
     for name, smallest in least.items():
         value = getattr(args, name)
         if value is not None and not smallest <= value < 2**31:
@@ -249,20 +250,17 @@ def check_numbers(args: argparse.Namespace, **least: int) -> None:
 
 def check_writable(file: Path) -> None:
     """Raise a UserError for a file that cannot be written or grow, before hours of work on its content."""
-    new = not file.exists()
-    if not new and not file.is_file():
+    if file.exists() and not file.is_file():
         raise UserError(f"{file} is no regular file: it cannot be kept for the next time")
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with file.open("ab", buffering=0) as out:
-            size = out.tell()
-            fits = out.write(bytes(4096)) == 4096
-            out.truncate(size)
+        folder = file.resolve().parent
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder, buffering=0) as probe:  # the file itself is left alone
+            fits = probe.write(bytes(4096)) == 4096
+        if file.exists():
+            file.open("ab").close()
     except OSError as error:
         raise UserError(f"{file} cannot be written: {error.strerror}") from error
-    finally:
-        if new:
-            file.unlink(missing_ok=True)
     if not fits:
         raise UserError(f"{file} cannot be written: no space left")
 

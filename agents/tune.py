@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -148,6 +149,7 @@ def search_settings(
             else:
                 setting["runs"] = sorted([*setting["runs"], rounded_data(found)], key=lambda run: run["seed"])
                 write_file(file, results_json(data))
+                shutil.rmtree(Path(folder, f"{setting['number']}-{seed}"), ignore_errors=True)
                 how = f"return {found['return']:.2f} in {found['seconds']:.0f} s"
             print(f"setting {setting['number']}, seed {seed}: {how}", flush=True)
     return data, failed

@@ -83,13 +83,15 @@ def test_all_together_single_and_vector(mode):
 
 
 #: The same without what divides steps.
-WHOLE = ALL | {"observation_delay": 0.04, "action_delay": 0.06, "lag": None}
+WHOLE = ALL | {"observation_delay": 0.04, "action_delay": 0.06}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_what_divides_no_step_single_and_vector(mode):
-    _, envs = played(ID, 3, 70, mode, duration=0.5, **WHOLE)
+@pytest.mark.parametrize(
+    ("mode", "lag"),
+    [("NextStep", 0.01), slow("SameStep", 0.01), slow("NextStep", None), slow("SameStep", None)],
+)
+def test_what_divides_no_step_single_and_vector(mode, lag):
+    _, envs = played(ID, 3, 70, mode, duration=0.5, **WHOLE | {"lag": lag})
     assert type(envs.unwrapped._program) is WholeProgram
 
 

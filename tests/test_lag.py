@@ -548,8 +548,9 @@ def test_environment_without_actions_cannot_lag():
         own_tasks.Drift(lag=0.1)
 
 
-def test_refused_step_leaves_the_environments_as_they_were():
-    keywords = {"lag": 0.05, "damping": 1e6, "max_episode_steps": 500}
+@pytest.mark.parametrize(("more", "command"), [({}, 5), ({"action_delay": 0.01}, 0)])
+def test_refused_step_leaves_the_environments_as_they_were(more, command):
+    keywords = {"lag": 0.05, "damping": 1e6, "max_episode_steps": 500} | more
     env, envs = gym.make("PivotedBar-v0", **keywords), gym.make_vec("PivotedBar-v0", num_envs=2, **keywords)
     env.reset(seed=0, options={"state": [0.0, 0.0, 2.0, 1.0]})
     envs.reset(seed=0)
@@ -558,9 +559,10 @@ def test_refused_step_leaves_the_environments_as_they_were():
     np.testing.assert_array_equal(env.unwrapped.state, [0.0, 0.0, 2.0, 1.0])
     assert env.unwrapped.control == 0.0
     before = envs.unwrapped.state
-    with pytest.raises(StepRefused, match="could not be certified"):
+    with pytest.raises(StepRefused, match=rf"s_ddot={command} and .* could not be certified"):
         envs.step(np.ones((2, 1), np.float32))
     np.testing.assert_array_equal(envs.unwrapped.state, before)
+    np.testing.assert_array_equal(envs.unwrapped.control, [0.0, 0.0])
 
 
 # --- documentation ------------------------------------------------------------------------------------------

@@ -90,8 +90,9 @@ def test_timings_run_alone(tmp_path):
     assert len(results) == 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_interrupt_keeps_what_is_finished(tmp_path, number):
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+def test_interrupt_keeps_what_is_finished(tmp_path, name):
     code = (
         "from tests.dummy_section import job\n"
         "from lag_envs.report.runner import run_jobs\n"
@@ -114,9 +115,9 @@ def test_interrupt_keeps_what_is_finished(tmp_path, number):
     end = time.monotonic() + 60
     while time.monotonic() < end and not (file.exists() and load_results(file)):
         time.sleep(0.1)
-    child.send_signal(number)
+    child.send_signal(getattr(signal, name))
     told = child.communicate(timeout=30)[0].split()
-    assert told == (["1", "False"] if number == signal.SIGINT else [])
+    assert told == (["1", "False"] if name == "SIGINT" else [])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["references", "results.jsonl", "script.py"]
     assert [r.name for r in load_results(file)] == ["works"]
 
@@ -176,7 +177,10 @@ def test_command_line_errors(tmp_path, capsys):
         (["report", str(tmp_path)], "holds other things"),
         (["report", str(tmp_path / "thesis.txt")], "thesis.txt is no folder"),
         (["report", "--sections", "stabilty", str(tmp_path / "new")], "did you mean stability?"),
-        (["report", "--docs", "nowhere", str(tmp_path / "new")], "--docs: nowhere/README.md is missing"),
+        (
+            ["report", "--docs", "nowhere", str(tmp_path / "new")],
+            f"--docs: {Path('nowhere/README.md')} is missing",
+        ),
         (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs needs a whole report"),
         (
             ["report", "--sections", "bound", "--docs", ".", str(tmp_path / "new")],

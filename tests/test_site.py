@@ -170,7 +170,7 @@ def test_texts_of_records_lose_their_markup():
     page, own = (page, own) if "Ranking" in page else (own, page)
     assert "converse optimality [1])" in page and "<p>[1] J. C. Doyle" in page
     for text in (page, own):
-        assert "Here: upright throughout.</dd>" in text and "Here: until then.</dd>" in text
+        assert "Here: upright throughout.</dd>" in text and "Here: until success.</dd>" in text
     assert "mass 1, −20 %" in own and "actions a step late" in own
 
 

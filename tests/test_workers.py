@@ -37,6 +37,7 @@ def work(what):
     return greeting, os.environ["OMP_NUM_THREADS"]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_whatever_becomes_of_one_the_others_go_on():
     given = ["dies", "is killed", "hangs", "raises", "returns what cannot be sent", "works", "works too"]
     threads = os.environ.get("OMP_NUM_THREADS")
@@ -121,15 +122,15 @@ except KeyboardInterrupt:
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals to a process group")
 @pytest.mark.parametrize(
-    ("child", "signals", "told", "status"),
+    ("child", "signals", "pause", "told", "status"),
     [
-        ("obeys", [signal.SIGINT], "keeps it\n", 5),
-        ("obeys", [signal.SIGTERM], "keeps it\n", 5),
-        ("does not", [signal.SIGINT, signal.SIGINT], "", 130),
-        ("does not", [signal.SIGKILL], "", -signal.SIGKILL),
+        ("obeys", ["SIGINT"], 0.0, "keeps it\n", 5),
+        ("obeys", ["SIGTERM", "SIGTERM"], 0.0, "keeps it\n", 5),  # as `timeout` does
+        ("does not", ["SIGINT", "SIGINT"], 1.5 * workers.AT_ONCE, "", 130),
+        ("does not", ["SIGKILL"], 0.0, "", -9),
     ],
 )
-def test_a_process_stops_when_asked_and_is_killed_when_asked_again(child, signals, told, status):
+def test_a_process_stops_when_asked_and_is_killed_when_asked_again(child, signals, pause, told, status):
     """Ctrl-C in a terminal reaches both, a kill of the parent only that; in no case does the other go on."""
     script = "import os, sys; from lag_envs.workers import run_stoppable\n"
     script += f"sys.exit(run_stoppable([sys.executable, '-c', {STOPPABLE!r}, {child!r}], os.environ))"
@@ -138,9 +139,13 @@ def test_a_process_stops_when_asked_and_is_killed_when_asked_again(child, signal
         start_new_session=True,
     )  # fmt: skip
     assert parent.stdout.readline() == "begins\n"
-    for number in signals:
-        (os.killpg if number == signal.SIGINT else os.kill)(parent.pid, number)
-        time.sleep(0.5)
+    for name in signals:
+        (os.killpg if name == "SIGINT" else os.kill)(parent.pid, getattr(signal, name))
+        if pause:
+            while "stopping" not in (line := parent.stderr.readline()):
+                assert line
+            time.sleep(pause)
+            pause = 0.0
     out, _ = parent.communicate(timeout=60.0)  # ends with the last process that holds the pipe
     assert (out, parent.returncode) == (told, status)
 

@@ -31,10 +31,10 @@ def run_shown(program: str, run: Callable[[], int]) -> int:
             return 2
         except KeyboardInterrupt:
             return 130
-        except BrokenPipeError:  # the reader, such as `head`, has left
-            _drop_output()
-            return 0
         except OSError as error:
+            if isinstance(error, BrokenPipeError) and error.filename is None:
+                _drop_output()  # the reader, such as `head`, has left
+                return 0
             try:
                 sys.stdout.flush()
             except OSError:
@@ -71,6 +71,7 @@ def terminable() -> Iterator[None]:
         return
 
     def stop(*_: Any) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what is saved on the way out is saved in peace
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,9 @@ def new_file(text: str) -> Path:
     folder = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise argparse.ArgumentTypeError(f"{text} cannot be written: {folder} is no folder to write to")
+    with contextlib.suppress(OSError):  # no such file yet, or no output
+        if os.path.samestat(path.stat(), os.fstat(1)):
+            raise argparse.ArgumentTypeError(f"{text} is the file that this command prints to; name another")
     return path
 
 

@@ -173,45 +173,54 @@ def check_address(address: str) -> None:
 
 # --- one process that keeps what it has when it is stopped --------------------------------------------------
 
+#: Signals that follow the first one within this time [s] count as the same: `timeout` sends two.
+AT_ONCE = 0.5
 _asked = threading.Event()
 
 
 def run_stoppable(command: Sequence[str], environment: Mapping[str, str]) -> int:
     """Run a command that calls `obey_parent`, and return its exit status.
 
-    At the first Ctrl-C or SIGTERM it is asked to stop, at the second it is killed. It cannot outlive this
-    process.
+    At the first Ctrl-C or SIGTERM it is asked to stop. It is killed at the second, unless that comes within
+    `AT_ONCE`. It cannot outlive this process.
     """
     signals = (signal.SIGINT, signal.SIGTERM)
     # On POSIX, the command goes on ignoring the terminal's Ctrl-C: only this process tells it.
     before = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
-    got = 0
+    asked = killed = 0.0
 
     def stop(*_: Any) -> None:
-        nonlocal got
-        got += 1
-        if got > 1:
+        nonlocal asked, killed
+        now = time.monotonic()
+        if not asked:
+            asked = now
+            with suppress(OSError, ValueError):  # it has just ended, or nobody reads this
+                os.write(pipe.fileno(), b".")
+                told = "\nstopping after what is being measured; again: at once, without results"
+                print(told, file=sys.stderr, flush=True)
+        elif now - asked > AT_ONCE:
+            killed = now
             child.kill()
-            return
-        print("\nstopping after what is being measured; again: at once, without results", file=sys.stderr)
-        with suppress(BrokenPipeError, ValueError):  # it has just ended
-            os.write(pipe.fileno(), b".")
 
     try:
         with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE) as child:
             pipe = cast(IO[bytes], child.stdin)
             for number in signals:
                 signal.signal(number, stop)
-            status = child.wait()
+            while (status := child.poll()) is None:
+                with suppress(subprocess.TimeoutExpired):
+                    # On Windows, a wait without end lets no handler run.
+                    child.wait(0.2 if os.name == "nt" else None)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    return 130 if got > 1 else status
+    return 130 if killed else status
 
 
 def obey_parent() -> None:
     """Let the parent stop this process, which ends with it, see `run_stoppable`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: _asked.set())
 
     def listen() -> None:
         while os.read(0, 1):

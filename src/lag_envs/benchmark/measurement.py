@@ -93,7 +93,8 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         "speedups": speedups(rows),
         "arithmetic": arithmetic(rows),
     } | sections
-    output = Path(settings.output) if settings.output and any(row.rates for row in rows) else None
+    measured = complete or times or any(row.rates for row in rows)
+    output = Path(settings.output) if settings.output and measured else None
     try:
         if output:
             write_file(output, report_json(report))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import tempfile
 import warnings
 from dataclasses import asdict
 
@@ -17,7 +18,9 @@ from lag_envs.workers import obey_parent, run_stoppable
 def in_own_process(settings: BenchmarkSettings) -> int:
     """Run `bench` in a separate process, on as many cores as it has threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark.process", json.dumps(asdict(settings))]
-    return run_stoppable(command, os.environ | ONE_THREAD)
+    # What it keeps for a while goes even if it is killed.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        return run_stoppable(command, os.environ | ONE_THREAD | {"TMPDIR": folder})
 
 
 def main() -> int:

@@ -46,7 +46,7 @@ def needs(extra: str, *packages: str) -> None:
 
 
 def check_checkout(option: str, folder: str) -> None:
-    """Raise a UserError before anything is measured, if the checkout that an option names is none."""
+    """Raise a UserError unless the folder of an option is a checkout that can be written to."""
     for name in ("README.md", "docs/speed.json", "docs/speed.md"):
         if not os.access(Path(folder, name), os.W_OK):
             raise UserError(f"{option}: {Path(folder, name)} is missing, or cannot be written to")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from lag_envs.commands.base import Command
-from lag_envs.errors import UserError
 from lag_envs.tables import aligned
 
 
@@ -23,10 +23,11 @@ def run_cache(args: argparse.Namespace) -> int:
         print("There is no folder for caches: each process compiles what it uses.")
         return 0
     if args.clear:
-        print(f"{place}: {cache.clear(place)} files removed")
-        if left := cache.cache_files(place):
-            raise UserError(f"files that cannot be removed: {len(left)}, such as {left[0].path}")
-        return 0
+        found = cache.cache_files(place)
+        print(f"{place}: {cache.clear(place)} files removed", flush=True)
+        if left := [entry.path for entry in found if entry.path.exists()]:
+            print(f"lag-envs: error: cannot be removed: {len(left)}, such as {left[0]}", file=sys.stderr)
+        return 1 if left else 0
     kept = cache.cache_files(place)
     size = sum(entry.size for entry in kept)
     rows = [

@@ -67,11 +67,13 @@ class Program:
     reaching: Sequence[str] = ()
     #: Whether a batch has a loop after the step for what the sensors show.
     sensing = False
-    #: Where actuators lag, the rows ``u`` keep the controls in force; these are their names at a step's start
-    #: and end. In between ``u`` are the commands, and from the lines `behind` on the means over the step.
+    #: Where actuators lag: names of the controls in force at a step's start and end, which the rows ``u``
+    #: keep between steps. Within a step ``u`` are the commands, until the lines `means` replace them by the
+    #: mean controls, which rewards use. A batch keeps the commands of a refused step in rows `asked`.
     in_force: Sequence[str] = ()
     in_force_after: Sequence[str] = ()
-    behind: Sequence[str] = ()
+    means: Sequence[str] = ()
+    asked: Sequence[str] = ()
 
     def __init__(
         self,
@@ -202,7 +204,7 @@ class Program:
             *self._one.load(self.u[: len(self.in_force)], self.in_force),
             *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
-            *self._command_one, *self._controls, *self.fast, *self._advance_one, *self.behind,
+            *self._command_one, *self._controls, *self.fast, *self._advance_one, *self.means,
             *self._one.store(self.u, self.in_force_after or self.u), *self._finish_one(),
         ]  # fmt: skip
         helpers = [self._stepper.engine()] if self.general else []
@@ -392,14 +394,14 @@ class Program:
             start, dt = f"np.int64({len(self.uniform)})", "k_dt"
             call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
             moving = [*indented(lane, before), call]
-            again = [*given, *after, *self._stepper.finish, *self.behind]
+            again = [*given, *after, *self._stepper.finish, *self.means]
             move = [*again, "within = status > 0.0"]
             helpers = [self._stepper.compile_block()]
         else:
             moving, move = [], [*controls, *self.fast]
             again = [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
             helpers = [self._stepper.engine()]
-        refused = [*self._load(self.held, self.u), *self._store(self.u)] if self.in_force else []
+        refused = [*self._load(self.held, self.asked), *self._store(self.asked)] if self.asked else []
         # If the fast formula does not hold, or the last reward is special, the start is kept for another try.
         holds = "within and not over > 0.0" if self.last else "within"
         main = [

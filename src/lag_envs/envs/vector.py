@@ -415,9 +415,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         They are 0 after a reset.
         """
-        return single_number(
-            np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
-        )
+        return self._controls(self._program.u)
+
+    def _controls(self, rows: Sequence[str]) -> NDArray[np.float64]:
+        return single_number(np.array([self._read(name) for name in rows]).reshape(-1, self.num_envs).T)
 
     @property
     def parameters(self) -> dict[str, NDArray[np.float64]]:
@@ -582,7 +583,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
-        error = self.tasks[i].formulas.refusal(self.state[i], self.control[i], self.task.dt, where)
+        control = self._controls(self._program.asked or self._program.u)[i]
+        error = self.tasks[i].formulas.refusal(self.state[i], control, self.task.dt, where)
         error.results = results
         return error
 

@@ -270,7 +270,8 @@ def run_verify(args: argparse.Namespace) -> int:
         done = [result["folder"] for result in results]
         rest = [folder for folder in map(str, folders) if folder not in done]
         other = ", with another --json" if args.json and results else ""
-        print(f"interrupted; left to verify{other}: {shlex.join(rest)}", file=sys.stderr)
+        if rest:
+            print(f"interrupted; left to verify{other}: {shlex.join(rest)}", file=sys.stderr)
         raise
     finally:  # also after an error
         if args.json and results:

@@ -9,13 +9,13 @@ from typing import Any
 from lag_envs.envs import sharing
 from lag_envs.envs.imperfect.actuators import Actuators
 from lag_envs.envs.imperfect.drawn import DrawnProgram
+from lag_envs.envs.imperfect.lagged import lagged_code
 from lag_envs.envs.imperfect.motion import Held, Lagged
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
 from lag_envs.envs.lines import compiled_lines, indent, next_episode
 from lag_envs.envs.program import SLOW
 from lag_envs.stepping.compiling import BLOCK
-from lag_envs.stepping.lag import lagged_stepper
 from lag_envs.stepping.rows import Rows
 from lag_envs.tasks.base import Task
 
@@ -49,10 +49,7 @@ class DividedProgram(DrawnProgram):
         self._lagged: Any = None
         self._motion: Held | Lagged
         if found.lag:
-            lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
-            self._lagged = lagged_stepper(scene.mechanics).code(
-                frozenset(n for n, x in lagged.items() if x == 0.0)
-            )
+            self._lagged = lagged_code(scene, constants)
             lift = formulas.lift("z")
             self._motion = Lagged(self._lagged, lift, self.n_state, self.y, self.z, self.u, constants)
         else:
@@ -212,7 +209,7 @@ class DividedProgram(DrawnProgram):
             f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
             f"if over == {SLOW}:",
             "    refused, over = max(refused, np.uint64(lane + 1)), 0",
-            *indent([*self._work.load(self.held), *self._lane.store(self.u, self.held)]),
+            *indent([*self._work.load(self.held), *self._lane.store(self.asked or self.u, self.held)]),
             "if over > 0:",
             *indent([*self._lane.store(["n"], ["-np.float64(over)"]), "overs += np.uint64(1)"]),
         ]

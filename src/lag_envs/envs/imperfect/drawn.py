@@ -25,7 +25,8 @@ class DrawnProgram(Program):
         self._made = DerivedConstants(task, absent) if task.drawn else None
         changed = self._made.changed if self._made else []
         self.p = [f"p_{d.name}" for d in self.options.drawn]
-        self.own = [*self.p, *self.own]
+        self.asked = [f"asked{i}" for i in range(len(self.options.lag))]
+        self.own = [*self.p, *self.own, *self.asked]
         self._source = task.drawn.inner if task.drawn else task
         super().__init__(self._source, absent, varying | frozenset(changed), list(numbers_of(task)))
         self.drawn = [*self.p, *(f"k_{name}" for name in self.varying if name in changed)]

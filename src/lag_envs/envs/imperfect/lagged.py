@@ -6,7 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.lag import lagged_stepper
+
+
+def lagged_code(scene: Any, constants: Mapping[str, Any]) -> Any:
+    """Return the code of a scene's step with lag, without the terms of constants that are zero."""
+    lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
+    return lagged_stepper(scene.mechanics).code(absent_from(lagged))
 
 
 class LaggedCode:
@@ -34,13 +41,12 @@ class LaggedCode:
         lift_end: Sequence[str],
         constants: Mapping[str, Any],
     ) -> None:
-        lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
-        code = lagged_stepper(scene.mechanics).code(frozenset(n for n, x in lagged.items() if x == 0.0))
+        code = lagged_code(scene, constants)
         n = range(len(code.controls) // 3)
         self.start, self.end = start, end
         self.in_force = [f"reached{i}" for i in n]
         self.in_force_after = [f"u{i}_end" for i in n]
-        self.behind = [f"u{i} = u{i}_mean" for i in n]
+        self.means = [f"u{i} = u{i}_mean" for i in n]
         self._names = {name: name.replace("k_", "k_lagged_", 1) for name in code.constants}
         for i in n:
             decay = str(constants[f"decay{i}"])

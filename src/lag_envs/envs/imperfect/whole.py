@@ -39,7 +39,7 @@ class WholeProgram(DrawnProgram):
         if not self.options.lag:
             return held
         code = LaggedCode(self._source.scene, held.start, held.end, formulas.lift("z"), constants)
-        self.in_force, self.in_force_after, self.behind = code.in_force, code.in_force_after, code.behind
+        self.in_force, self.in_force_after, self.means = code.in_force, code.in_force_after, code.means
         return code
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:

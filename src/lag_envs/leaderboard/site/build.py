@@ -80,8 +80,8 @@ COLUMNS = (
     Column(
         "settle",
         "Settle",
-        "Median time until the goal is reached for good, over all episodes; missing if half of them never "
-        "reach it.",
+        "Median time until the goal is reached for good, unless said otherwise; over all episodes, missing "
+        "if half of them never reach it.",
         True,
     ),
     Column("effort", "Effort", "Mean square of the control, as a share of its limit.", True),
@@ -268,7 +268,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     known = board["known"] or {}
     returns = [known.get("random"), known.get("best"), *(row["return"] for row in board["rows"])]
     largest = max((abs(x) for x in returns if isinstance(x, int | float)), default=0.0)
-    #: Digits of all returns, so that they line up.
+    # All returns have as many digits, so that they line up.
     board["digits"] = 1 if largest >= 100.0 else 2 if largest >= 10.0 else 3
     board["goals"] = _goals(board["goal"])
     board["page"] = _slug(str(given["id"]))
@@ -294,7 +294,7 @@ def _goals(goal: str | None) -> dict[str, str]:
     Examples
     --------
     >>> _goals("success: across the line; time: until then")
-    {'success': 'across the line', 'settle': 'until then'}
+    {'success': 'across the line', 'settle': 'until success'}
     >>> _goals("success: upright; time: until it is so for good"), _goals("success: up; there is no time")
     ({'success': 'upright'}, {'success': 'up'})
     """
@@ -302,7 +302,9 @@ def _goals(goal: str | None) -> dict[str, str]:
         return {}
     joined = goal.removeprefix("success: ").replace(", and time: ", "; time: ")
     success, _, time = joined.partition("; time: ")
-    time = time.removeprefix("until it is so for good").removeprefix(", ")
+    time = (
+        time.removeprefix("until it is so for good").removeprefix(", ").replace("until then", "until success")
+    )
     return {"success": success.removesuffix("; there is no time")} | ({"settle": time} if time else {})
 
 
