@@ -20,8 +20,8 @@ _ANGLES = {
     "cos(theta_2)": ("1", "cosine of the second link's angle against the first, 1 straight"),
     "sin(theta_2)": ("1", "its sine"),
 }
-#: For learners with a replay buffer on the real machines: a step is short and pays at most 0.02, so noise is
-#: held for 0.05 s, and eight steps count together.
+#: For learners with a replay buffer on the real machines, where a step is short and pays at most 0.02: eight
+#: steps count together. Below, noise is held for 0.05 s, and rewards are multiplied.
 _PATIENT = {"n_timesteps": 3e5, "n_steps": 8, "gamma": 0.995}
 
 
