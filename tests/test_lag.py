@@ -35,6 +35,7 @@ from lag_envs.stepping.machine import LaneLayout
 from lag_envs.stepping.series import REACH, Series
 from lag_envs.stepping.target import Plain
 from lag_envs.stepping.tracing import evaluate_operations
+from lag_envs.tasks import arm
 
 #: Error of a control step, relative to the entry or to 1.
 LARGEST_ERROR = 2e-13
@@ -563,6 +564,23 @@ def test_refused_step_leaves_the_environments_as_they_were(more, command):
         envs.step(np.ones((2, 1), np.float32))
     np.testing.assert_array_equal(envs.unwrapped.state, before)
     np.testing.assert_array_equal(envs.unwrapped.control, [0.0, 0.0])
+
+
+@pytest.mark.parametrize("env_id", [arm.Reach.id, "PivotedBar-v0"])
+@pytest.mark.parametrize("more", [{}, slow({"action_delay": 0.013})])
+def test_a_batch_has_an_order_and_snapshots(env_id, more):
+    envs = gym.make_vec(env_id, num_envs=3, lag=0.03, **more).unwrapped
+    envs.reset(seed=0)
+    envs.order = 12
+    assert envs.order == 12
+    actions = [envs.action_space.sample() for _ in range(6)]
+    envs.step(actions[0])
+    snapshot = envs.get_state()
+    first = [envs.step(action)[:2] for action in actions]
+    envs.set_state(snapshot)
+    for one, action in zip(first, actions, strict=True):
+        for a, b in zip(one, envs.step(action), strict=False):
+            np.testing.assert_array_equal(a, b)
 
 
 # --- documentation ------------------------------------------------------------------------------------------

@@ -225,6 +225,11 @@ class Program:
         ]  # fmt: skip
 
     @property
+    def order_constant(self) -> str | None:
+        """Name of the constant that is the order of the general series; None if steps do without."""
+        return str(self._x).removeprefix("k_") if self.general else None
+
+    @property
     def tries_all(self) -> bool:
         """Whether a step that `step_one` does not take is refused, rather than left to `advance`."""
         return self.general
@@ -423,7 +428,7 @@ class Program:
                 *inputs, *again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
-                *indent([*self._store(["over"], ["0.0"]), *refused]),
+                *indent([*self._store(["over", "r"], ["0.0", "0.0"]), *refused]),
                 "else:",
                 *indent([
                     *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),

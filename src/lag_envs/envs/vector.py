@@ -33,7 +33,6 @@ from lag_envs.envs.interface import (
 from lag_envs.envs.program import BLOCK
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
-from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -438,12 +437,16 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         The order changes only the speed: each step is certified to the same tolerance with any order.
         """
-        return None if form_of(self.scene) else int(self._pars[0][self._program.uniform.index("x")])
+        name = self._program.order_constant
+        return None if name is None else int(self._pars[0][self._program.uniform.index(name)])
 
     @order.setter
     def order(self, value: int) -> None:
+        name = self._program.order_constant
+        if name is None:
+            raise ValueError(f"{type(self.task).__name__} has a flow of its own: there is no order to choose")
         for par in self._pars:
-            par[self._program.uniform.index("x")] = check_order("order", value)
+            par[self._program.uniform.index(name)] = check_order("order", value)
 
     @property
     def spec(self) -> EnvSpec | None:

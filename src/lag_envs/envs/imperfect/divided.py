@@ -60,6 +60,11 @@ class DividedProgram(DrawnProgram):
         ]  # fmt: skip
 
     @property
+    def order_constant(self) -> str | None:
+        """See `Program.order_constant`."""
+        return "lagged_order" if self._lagged else super().order_constant
+
+    @property
     def tries_all(self) -> bool:
         """See `Program.tries_all`."""
         return True
