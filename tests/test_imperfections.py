@@ -26,6 +26,7 @@ from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import form_of
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks import TASKS, pivoted_bar
 from lag_envs.tasks.imperfections import KEYWORDS, LARGEST_NORMAL, MARGIN
@@ -213,7 +214,7 @@ def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch
         module, "compile_function", lambda name, source, *_, **options: printed.append(source)
     )
     task = make_task(ID)
-    program = Program(task, frozenset(n for n, x in task.formulas.constants().items() if x == 0.0))
+    program = Program(task, absent_from(task.formulas.constants()))
     _ = program.step_one, program.start_one, program.start_all, program.finish_one
     assert len(printed) == 4 and set(program.kept) == {*program.y, *program.u, "n"}
     own = ("slot", "key_", "share", "mean_", "shown_at", "seen", "sigma", "slew", "push", "late")

@@ -27,7 +27,7 @@ from lag_envs.scenes import Chain, StepRefused
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import compiling, driver, general, machine
 from lag_envs.stepping.certificate import SMALLEST_SIZE, Certificate
-from lag_envs.stepping.compiling import BLOCK, compile_python
+from lag_envs.stepping.compiling import BLOCK, absent_from, compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.lowering import ELAPSED
@@ -87,8 +87,7 @@ def stepper(scene: Scene, fused: bool = True):
     """Return the scene's stepper, its constants and its code."""
     found = SeriesStepper(scene.mechanics)
     constants = found.constants(parameter_values(scene))
-    zero = frozenset(name for name, value in constants.items() if value == 0.0)
-    return found, constants, found.code(zero, fused)
+    return found, constants, found.code(absent_from(constants), fused)
 
 
 def record_of(system, fused=True):

@@ -33,6 +33,7 @@ from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.stepping.slope import FixedSlope, TurningSlope
 from lag_envs.tasks import TASKS
@@ -64,14 +65,13 @@ def coefficients(scene):
 
 def operations(scene):
     """Return the number of operations of an ordinary step."""
-    zero = frozenset(name for name, value in motion_constants_of(scene).items() if value == 0.0)
-    return form_of(scene).stepper(0.02, zero).operations
+    return form_of(scene).stepper(0.02, absent_from(motion_constants_of(scene))).operations
 
 
 def advance_of(scene, dt):
     """Return the scene's compiled step, and its arguments after state, control and step."""
     numbers = motion_constants_of(scene)
-    code = form_of(scene).stepper(dt, frozenset(name for name, value in numbers.items() if value == 0.0))
+    code = form_of(scene).stepper(dt, absent_from(numbers))
     return code.compile(), [form_of(scene).largest_majorant(dt), *(v for v in numbers.values() if v)]
 
 

@@ -16,6 +16,7 @@ from lag_envs.envs.unfused import Unfused
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.shapes import Circle
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.script import LARGEST, Script
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, pivoted_bar
@@ -106,7 +107,7 @@ def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     scene = outer.scene
     stepper = stepper_of(scene.mechanics)
     constants = stepper.constants(parameter_values(scene))
-    code = stepper.code(frozenset(n for n, x in constants.items() if x == 0.0), fused=False)
+    code = stepper.code(absent_from(constants), fused=False)
     advance = code.compile()
     numbers = [constants[name.removeprefix("k_")] for name in code.constants]
     env = Unfused(task())
