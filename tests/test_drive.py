@@ -700,7 +700,7 @@ def test_ghosts_run_beside(drive, haunted):
     until(page, f"location.hash === '#seed={2**61 + 3}'")
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
-    assert page.evaluate("document.activeElement.className") == "stage"
+    until(page, "document.activeElement.className === 'stage'")
 
 
 # --- speed --------------------------------------------------------------------------------------------------
