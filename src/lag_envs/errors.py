@@ -24,7 +24,7 @@ def run_shown(program: str, run: Callable[[], int]) -> int:
     with terminable():
         try:
             status = run()
-            sys.stdout.flush()  # what it cannot take is told below, not by Python at exit
+            sys.stdout.flush()  # if that fails, it is reported below, not by Python at exit
             return status
         except UserError as error:
             print(f"{program}: error: {error}", file=sys.stderr)
@@ -71,7 +71,7 @@ def terminable() -> Iterator[None]:
         return
 
     def stop(*_: Any) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what is saved on the way out is saved in peace
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop what is saved on the way out
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)

@@ -105,7 +105,7 @@ def compile_function(
 
 
 def absent_from(*constants: Mapping[str, float]) -> frozenset[str]:
-    """Return the names of the constants that are zero in all of the given ones: they leave no code."""
+    """Return the names of the constants that are zero in every given set: they leave no code."""
     return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
