@@ -71,7 +71,7 @@ def terminable() -> Iterator[None]:
         return
 
     def stop(*_: Any) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop what is saved on the way out
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop what is still saved
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)

@@ -1,4 +1,4 @@
-"""What the single and the vector environment share towards Gymnasium: options, seeds, spaces, spec, info."""
+"""What both environments share in their interface to Gymnasium: options, seeds, spaces, spec, info."""
 
 from __future__ import annotations
 
