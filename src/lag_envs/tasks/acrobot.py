@@ -295,10 +295,6 @@ class AcrobotReal(Task):
             "reward_scale": 1.0, "noise_steps": 25,
         },
         "off_policy": {
-            "n_timesteps": 2e5, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_1e-3",
-            "policy_kwargs": {"net_arch": [128, 128], "noise_steps": 4},
-        },
-        "sac": {
             **_PATIENT, "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 30.0}}],
             "policy_kwargs": {"net_arch": [64, 64], "noise_steps": 25},
         },
