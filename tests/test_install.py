@@ -123,7 +123,7 @@ def test_no_skips_fails_what_is_skipped(tmp_path):
 
     def outcome(*options):
         command = [sys.executable, "-m", "pytest", "-q", "-p", "conftest", "-c", os.devnull, *options]
-        path = {"PYTHONPATH": str(ROOT / "tests")}
+        path = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ | path)
         return done.stdout
 

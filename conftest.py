@@ -1,4 +1,4 @@
-"""Options of the test command, and fixtures that several files use."""
+"""Options of the test command, and fixtures for the tests and the doctests of src and docs."""
 
 import gc
 import signal
