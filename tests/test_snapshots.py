@@ -148,6 +148,7 @@ OTHERS = [
     (ID, {"dt": 0.01}, "dt is 0.01 there, and 0.02 here"),
     (ID, {"duration": 3.0}, "duration is 3.0 there, and 10.0 here"),
     (ID, ALL, r"observation_noise is \(0.01, 0.0, .*\) there, and \(\) here"),
+    (ID, {"lag": 0.05}, r"lag is \(0.05,\) there, and \(\) here"),
     (SwingUpFree.id, {}, "task is .*SwingUpFree' there, and .*SwingUp' here"),
     ("CylinderInCylinderPump-v0", {}, "task is .*Pump' there"),
 ]

@@ -55,6 +55,7 @@ def properties(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
     found |= {"dt": first.dt, "duration": first.duration, "target": _common(targets)}
     asked = dataclasses.asdict(first.imperfections or Imperfections())
     del asked["drawn"]
+    asked["lag"] = tuple(1.0 / decay if decay else 0.0 for decay in asked["lag"])  # in seconds, as given
     drawn = [tuple(map(tuple, (task.imperfections or Imperfections()).drawn)) for task in tasks]
     return found | asked | {"randomize": _common(drawn)}
 
