@@ -319,9 +319,8 @@ class AcrobotReal(Task):
     note = (
         "The LQR is that of the project's leaderboard. It only holds links that are upright already; it "
         "does not swing up hanging ones. The plan was found on the exact model with friction; its feedback "
-        "comes from a model without dry friction. All learners stay well below the plan. TD3 and SAC, "
-        "which hold their noise for many steps, get furthest, from fewer steps than the PPO in one file. TQC "
-        "was tuned before that was found, and less."
+        "comes from a model without dry friction. All learners stay well below the plan. TD3, SAC and TQC, "
+        "which hold their noise for many steps, get further than the PPO in one file, from fewer steps."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
