@@ -70,8 +70,8 @@ class Program:
     #: Whether a batch has a loop after the step for what the sensors show.
     sensing = False
     #: Where actuators lag: names of the controls in force at a step's start and end, which the rows ``u``
-    #: keep between steps. Within a step ``u`` are the commands, until the lines `means` replace them by the
-    #: mean controls, which rewards use. A batch keeps the commands of a refused step in rows `asked`.
+    #: keep between steps, and of their means, which rewards use. Within a step ``u`` are the commands, until
+    #: the means replace them. A batch keeps the commands of a refused step in rows `asked`.
     in_force: Sequence[str] = ()
     in_force_after: Sequence[str] = ()
     means: Sequence[str] = ()
@@ -219,9 +219,14 @@ class Program:
         else:
             move = ["if not within:"]
         return [
-            *self._controls, *self.fast, *move, *indent(self._leave_one), *self.means,
+            *self._controls, *self.fast, *move, *indent(self._leave_one), *self._average,
             *self._one.store(self.u, self.in_force_after or self.u),
         ]  # fmt: skip
+
+    @property
+    def _average(self) -> list[str]:
+        """The lines that replace the commands of lagging actuators by the mean controls."""
+        return [f"{u} = {mean}" for u, mean in zip(self.u, self.means, strict=False)]
 
     @property
     def _room_one(self) -> str:
@@ -523,7 +528,7 @@ class Program:
         if not self.general:
             return [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
         return [
-            *self._load(self._commands, self.u), *self._in_force, *self.fast, *self._advanced, *self.means,
+            *self._load(self._commands, self.u), *self._in_force, *self.fast, *self._advanced, *self._average,
         ]  # fmt: skip
 
     def _claimed(self, body: Sequence[str]) -> list[str]:

@@ -98,7 +98,7 @@ class WholeProgram(DrawnProgram):
             # Not side by side: each environment has its own slot. One that is to be restarted has none.
             *(
                 indented(lane, [
-                    *self._load(["n"]),
+                    self._key, *self._load(["n"]),
                     "if n >= 0.0:", *indent([*self._load(self.a), *delay, *self._store(self.a)]),
                 ])
                 if delay
@@ -123,7 +123,9 @@ class WholeProgram(DrawnProgram):
             *(
                 indented(lane, [
                     *ordinary, "if ordinary == 1.0:",
-                    *indent([*clock, *self._load(self.o), *delay, *self._store(self.o)]),
+                    *indent([
+                        *clock, *self._load([*self.o, *sensors.taken]), *delay, *self._store(self.o),
+                    ]),
                 ])
                 if delay
                 else []
