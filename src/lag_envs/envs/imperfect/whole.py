@@ -1,4 +1,4 @@
-"""Steps during which no command changes and no sensor reads, so that a batch is stepped side by side."""
+"""Steps between imperfect actuators and sensors: commands before, observations after the whole step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lag_envs.tasks.base import Task
 class WholeProgram(DrawnProgram):
     """The compiled functions of a task with imperfections that divide no step; see `Imperfections.whole`.
 
-    The further rows that it keeps are those of `Sensors` and `Actuators`.
+    The arguments are those of `Program`. Its further rows are those of `Sensors` and `Actuators`.
     """
 
     sensing = True
