@@ -370,6 +370,7 @@ def test_lanes_of_a_block_have_the_bits_of_a_single_one():
     constants = motion_constants_of(case.scene, lagged=True)
     advance, xp = code.compile(), types.SimpleNamespace(where=lambda c, a, b: a if c else b)
     memory, alone = np.zeros((2 * layout.bounds + 1, BLOCK)), []
+    memory[layout.span] = dt
     for lane in range(30):
         state = generator.uniform(-1.0, 1.0, 4) * [1.0, 3.0, 3.1, 9.0]
         lag = 10.0 ** generator.uniform(-4, 3)
@@ -379,7 +380,7 @@ def test_lanes_of_a_block_have_the_bits_of_a_single_one():
             memory[row, lane] = given[name]
         *end, _, _, status = advance(np.zeros(code.scratch), *state, *u, dt, float(order), *numbers)
         alone.append([end[0], end[2], end[1], end[3], status])
-    compile_advance_block(code.record)(memory.reshape(-1), 0, 30, dt, order)
+    compile_advance_block(code.record)(memory.reshape(-1), 0, 30, order)
     np.testing.assert_array_equal(memory[layout.q : layout.status + 1, :30].T, alone)
     assert len({row[-1] for row in alone}) > 3
 

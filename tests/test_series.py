@@ -102,8 +102,8 @@ def inputs(system, state, control):
     return {name: given[name] for name in code.record.given}, q, v
 
 
-def _run(rows, dt, order, tolerance):
-    return attempt(rows, 0, dt, order, tolerance)  # noqa: F821
+def _run(rows, order, tolerance):
+    return attempt(rows, 0, order, tolerance)  # noqa: F821
 
 
 @cache
@@ -122,8 +122,8 @@ def attempts(system, cases, order, tolerance):
         for name, row in layout.inputs.items():
             rows[row] = given[name]
         rows[layout.q : layout.q + n], rows[layout.v : layout.v + n] = q, v
-        rows[layout.left] = rows[layout.wish] = h
-        run(rows, h, order, tolerance)
+        rows[layout.left] = rows[layout.wish] = rows[layout.span] = h
+        run(rows, order, tolerance)
         results.append((h - rows[layout.left], rows[layout.bounds + n : layout.bounds + 2 * n].tolist()))
     return results
 
@@ -362,8 +362,9 @@ def block_steps(system, cases, dt, order, fused=True, **options):
     """Return places, velocities and the status of each lane after a control step of a block."""
     record = record_of(system, fused)
     layout, rows = LaneLayout(record), rows_of(system, cases)
+    rows[layout.span] = dt
     advance = compile_advance_block(record, fused=fused, **options)
-    refused = advance(rows.reshape(-1), 0, len(cases), dt, order)
+    refused = advance(rows.reshape(-1), 0, len(cases), order)
     assert refused == (rows[layout.status, : len(cases)] < 0).sum()
     return rows[layout.q : layout.status + 1, : len(cases)].T
 
@@ -423,12 +424,13 @@ def advance_in_python(record, tolerance=TOLERANCE, fused=False):
     """Replace `compile_advance`: the driver's own code on `Plain`."""
     series, layout, n = Series(record), LaneLayout(record), record.size
 
-    def attempt(rows, at, dt, order, tolerance):
+    def attempt(rows, at, order, tolerance):
         given = {name: rows[row] for name, row in layout.inputs.items()}
         q, v = (list(rows[first : first + n]) for first in (layout.q, layout.v))
-        lane = StepProgress(q, v, *rows[layout.status : layout.bounds])
+        lane = StepProgress(q, v, *rows[layout.status : layout.span])
+        dt = rows[layout.span]
         after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
-        rows[layout.q : layout.bounds] = [*after.q, *after.v, after.status, after.left, after.wish]
+        rows[layout.q : layout.span] = [*after.q, *after.v, after.status, after.left, after.wish]
         for row, bound in enumerate(bounds, layout.bounds):
             rows[row] += bound
         return not after.left > 0.0
@@ -742,7 +744,7 @@ def attempt_for(target, machine_code, fused, lanes):
     module = ir.Module()
     module.triple = target
     double, whole = ir.DoubleType(), ir.IntType(64)
-    kind = ir.FunctionType(whole, [double.as_pointer(), double, whole, double])
+    kind = ir.FunctionType(whole, [double.as_pointer(), whole, double])
     machine._write(module, "attempt", kind, record, lanes, fused)
     parsed = binding.parse_assembly(str(module))
     return parsed, machine_code.emit_assembly(parsed)
@@ -784,16 +786,16 @@ def test_bits_do_not_depend_on_fused_instructions():
     assert "x86_64" not in triple or not re.search(r"^\s+vfn?m", assembly, re.MULTILINE)
     engine = binding.create_mcjit_compiler(module, machine_code)
     engine.finalize_object()
-    kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_int64, ctypes.c_double)
+    kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64, ctypes.c_double)
     attempt = kind(engine.get_function_address("attempt"))
     layout, rows = LaneLayout(record_of(system)), rows_of(system, [system.draw(np.random.default_rng(14))])
     results = []
     for run in (attempt, compiled(record_of(system))):
         one = np.zeros(layout.rows)
         one[: layout.status] = rows[: layout.status, 0]
-        one[layout.left] = one[layout.wish] = 0.02
+        one[layout.left] = one[layout.wish] = one[layout.span] = 0.02
         given = one.ctypes.data if run is attempt else one
-        run(given, 0.02, order, TOLERANCE)
+        run(given, order, TOLERANCE)
         results.append(one)
     assert results[0][layout.left] < 0.02
     np.testing.assert_array_equal(*results)

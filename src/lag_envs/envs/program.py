@@ -65,11 +65,13 @@ class Program:
     #: Those of its own rows that a step replaces once it is accepted, and the names of their new values.
     reached: Sequence[str] = ()
     reaching: Sequence[str] = ()
+    #: Further rows needed within a step.
+    passing: Sequence[str] = ()
     #: Whether a batch has a loop after the step for what the sensors show.
     sensing = False
     #: Where actuators lag: names of the controls in force at a step's start and end, which the rows ``u``
-    #: keep between steps. Within a step ``u`` are the commands, until the lines `means` replace them by the
-    #: mean controls, which rewards use. A batch keeps the commands of a refused step in rows `asked`.
+    #: keep between steps, and of their means, which rewards use. Within a step ``u`` are the commands, until
+    #: the means replace them. A batch keeps the commands of a refused step in rows `asked`.
     in_force: Sequence[str] = ()
     in_force_after: Sequence[str] = ()
     means: Sequence[str] = ()
@@ -109,7 +111,7 @@ class Program:
         self.held = [f"held{i}" for i in range(len(self.u))]
         self.scratch = [
             *self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held, *self.reaching,
-            *(["clock"] if self.sensing else []),
+            *(["clock"] if self.sensing else []), *self.passing,
         ]  # fmt: skip
 
     def _step_code(self, formulas: Any, absent: frozenset[str], constants: dict[str, Any]) -> Any:
@@ -204,25 +206,38 @@ class Program:
             *self._one.load(self.u[: len(self.in_force)], self.in_force),
             *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
-            *self._command_one, *self._controls, *self.fast, *self._advance_one, *self.means,
-            *self._one.store(self.u, self.in_force_after or self.u), *self._finish_one(),
+            *self._command_one, *self._move_one, *self._finish_one(),
         ]  # fmt: skip
-        helpers = [self._stepper.engine()] if self.general else []
+        helpers = [self._stepper.engine()] if self.tries_all else []
         return compiled_lines("step_one", "f, obs, a, ids", body, *helpers)
 
     @property
-    def _advance_one(self) -> list[str]:
-        slow = [
-            *self._one.store([*self.held, *self.reaching], [*self.u, *self.reaching]),
-            f"return 0.0, {SLOW}",
-        ]
-        if not self.general:
-            return ["if not within:", *indent(slow)]
-        first = len(self.kept + self.scratch) + len(self.uniform)
+    def _move_one(self) -> list[str]:
+        """The lines from the command and ``y`` to ``z``, with the controls of the reward in ``u``."""
+        if self.general:
+            move = [self._room_one, *self._stepper.any_step, "if status < 0:"]
+        else:
+            move = ["if not within:"]
         return [
-            f"rows, order = f[{first}:], {self._x}", *self._stepper.any_step,
-            "if status < 0:", *indent(slow),
+            *self._controls, *self.fast, *move, *indent(self._leave_one), *self._average,
+            *self._one.store(self.u, self.in_force_after or self.u),
         ]  # fmt: skip
+
+    @property
+    def _average(self) -> list[str]:
+        """The lines that replace the commands of lagging actuators by the mean controls."""
+        return [f"{u} = {mean}" for u, mean in zip(self.u, self.means, strict=False)]
+
+    @property
+    def _room_one(self) -> str:
+        """The line that names what the general series takes."""
+        return f"rows, order = f[{len(self.kept + self.scratch) + len(self.uniform)}:], {self._x}"
+
+    @property
+    def _leave_one(self) -> list[str]:
+        """The lines that end `step_one` at a step that was not taken."""
+        store = self._one.store([*self.held, *self.reaching], [*self.u, *self.reaching])
+        return [*store, f"return 0.0, {SLOW}"]
 
     @property
     def order_constant(self) -> str | None:
@@ -375,49 +390,24 @@ class Program:
     @cached_property
     def step_blocks(self) -> Callable:
         """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
-        y, varying = self.y, [f"k_{name}" for name in self.varying]
+        y, inputs = self.y, self._inputs
         lane, ordinary = "for i in range(size):", self._load(["ordinary"])
-        inputs = self._load([*varying, *y, *self.g, *self.reached, "n"])
         results = ["n", "over", "r", *self.o, *(["clock"] if self.sensing else [])]
         counted = ["clock = n"] if self.sensing else []
         key = [self._key] if self.kick else []
-        controls = [*self._load(self.a), *self._controls]
-        present = self._load(self.u[: len(self.in_force)], self.in_force)
         ends = list(zip(self.in_force, self.in_force_after, strict=True))
-        if self.general:
-            rows = dict(zip(self._stepper.rows, self.flow, strict=True))
-            commands = self.held if self.in_force else self.u
-            given = [*self._load(commands, self.u), *present, *self.fast]
-            # The status of a lane shows that it is to be restarted, not stepped.
-            before = [
-                *inputs, *controls, *present, *self._stepper.prepare,
-                "status = select(n < 0.0, -1.0, 0.0)",
-                *self._store([*commands, *self.reaching], [*self.u, *self.reaching]),
-                *self._store([rows[name] for name in self._stepper.given], self._stepper.given),
-            ]  # fmt: skip
-            after = self._load([rows[name] for name in self._stepper.results], self._stepper.results)
-            start, dt = f"np.int64({len(self.uniform)})", "k_dt"
-            call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
-            moving = [*indented(lane, before), call]
-            again = [*given, *after, *self._stepper.finish, *self.means]
-            move = [*again, "within = status > 0.0"]
-            helpers = [self._stepper.compile_block()]
-        else:
-            moving, move = [], [*controls, *self.fast]
-            again = [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
-            helpers = [self._stepper.engine()]
         refused = [*self._load(self.held, self.asked), *self._store(self.asked)] if self.asked else []
         # If the fast formula does not hold, or the last reward is special, the start is kept for another try.
         holds = "within and not over > 0.0" if self.last else "within"
         main = [
-            *inputs, *move,
+            *inputs, *self._moved,
             "again = n < 0.0", *self.outcome,
             f"plain = {holds}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
             "n = n + 1.0", *counted, "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
             *(f"{start} = select(plain, {end}, {start})" for start, end in ends),
-            *self.observe, *self._store([*y, *([] if self.general else [*self.u, *self.reaching])]),
+            *self.observe, *self._store([*y, *([] if self._move_lanes else [*self.u, *self.reaching])]),
             *self._store(self.u[: len(ends)], self.in_force),
             *self._store([*results, "ordinary"]),
         ]  # fmt: skip
@@ -425,7 +415,7 @@ class Program:
             *ordinary,
             "if ordinary == 0.0:",
             *indent([
-                *inputs, *again,
+                *inputs, *self._again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
                 *indent([*self._store(["over", "r"], ["0.0", "0.0"]), *refused]),
@@ -442,7 +432,7 @@ class Program:
             ]),
             "elif ordinary == 2.0:",
             *indent([
-                *self._load([*varying, *self.g]),
+                *self._load([*(f"k_{name}" for name in self.varying), *self.g]),
                 *next_episode("first + i", "second + first + i", "last + first + i"),
                 "state_given, target_given = False, False", *self._start, *self._begin_lane,
                 "r = 0.0", "over = 0.0",
@@ -466,7 +456,7 @@ class Program:
                     for j, a in enumerate(self.a)
                     for line in indented(lane, self._store([a], [f"action[{self._action(j)}]"]))
                 ),
-                *self._command_lanes, *moving,
+                *self._command_lanes, *self._move_lanes,
                 *indented(lane, main),
                 *indented(lane, [*ordinary, "special += ordinary != 1.0"]),
                 "if special > 0:", *indent(indented(lane, special)),
@@ -475,9 +465,71 @@ class Program:
                 *self._show_block,
             ]),
         ]  # fmt: skip
+        engine = self._stepper.compile_block if self.general else self._stepper.engine
         return compiled_lines(
-            "step_blocks", sharing.STEP_BLOCKS, body, *helpers, *sharing.claiming(), inner=True
+            "step_blocks", sharing.STEP_BLOCKS, body, engine(), *sharing.claiming(), inner=True
         )
+
+    @property
+    def _inputs(self) -> list[str]:
+        """The lines that load what a step starts from."""
+        return self._load([*(f"k_{name}" for name in self.varying), *self.y, *self.g, *self.reached, "n"])
+
+    @property
+    def _commands(self) -> Sequence[str]:
+        """The rows that keep the commands within a step."""
+        return self.held if self.in_force else self.u
+
+    @property
+    def _in_force(self) -> list[str]:
+        """The lines that load the controls at a step's start, where actuators lag."""
+        return self._load(self.u[: len(self.in_force)], self.in_force)
+
+    @property
+    def _flow(self) -> dict[str, str]:
+        """The rows of the general series, by their names in its code."""
+        return dict(zip(self._stepper.rows, self.flow, strict=True))
+
+    def _advance_lanes(self, before: Sequence[str]) -> list[str]:
+        """Return the loop that fills in rows for the general series, and the call that moves the block."""
+        given = self._stepper.given
+        store = [*self._stepper.prepare, *self._store([self._flow[name] for name in given], given)]
+        call = f"advance_block(par, np.int64({len(self.uniform)}), size, np.int64({self._x}))"
+        return [*indented("for i in range(size):", [*before, *store]), call]
+
+    @property
+    def _advanced(self) -> list[str]:
+        """The lines that load what the general series made of it."""
+        results = self._stepper.results
+        return [*self._load([self._flow[name] for name in results], results), *self._stepper.finish]
+
+    @property
+    def _move_lanes(self) -> list[str]:
+        """The loops and calls that move a block before the main loop; a flow moves it there."""
+        if not self.general:
+            return []
+        # The status of a lane shows that it is to be restarted, not stepped.
+        return self._advance_lanes([
+            *self._inputs, *self._load(self.a), *self._controls, *self._in_force,
+            "status, span = select(n < 0.0, -1.0, 0.0), k_dt",
+            *self._store([*self._commands, *self.reaching], [*self.u, *self.reaching]),
+        ])  # fmt: skip
+
+    @property
+    def _moved(self) -> list[str]:
+        """The lines of the main loop to ``z`` and to the controls of the reward, and whether they hold."""
+        if self.general:
+            return [*self._again, "within = status > 0.0"]
+        return [*self._load(self.a), *self._controls, *self.fast]
+
+    @property
+    def _again(self) -> list[str]:
+        """The same with the commands stored, for any step of a single lane."""
+        if not self.general:
+            return [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
+        return [
+            *self._load(self._commands, self.u), *self._in_force, *self.fast, *self._advanced, *self._average,
+        ]  # fmt: skip
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""

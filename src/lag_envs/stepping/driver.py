@@ -37,34 +37,35 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
     Inputs, places and velocities are read; places and velocities are replaced.
     """
     rows[status] = 0.0
-    rows[left] = rows[wish] = dt
+    rows[left] = rows[wish] = rows[span] = dt
     for i in range(2 * n):
         rows[bounds + i] = 0.0
-    while attempt(rows, 0, dt, order, tolerance) == 0:
+    while attempt(rows, 0, order, tolerance) == 0:
         if rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt:
             return -np.int64(rows[status])
     return np.int64(rows[status])
 
 
-def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
+def _advance_block(memory, base, count, order):  # type: ignore[no-untyped-def]
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
     Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `LaneLayout`, without bounds; behind them is
-    room for as many rows and one more. A lane whose status is negative to begin with is left alone.
-    Afterwards it is the number of attempts, negative where a lane was refused.
+    room for as many rows and one more. Each lane has the length of its step in `span`. A lane whose status is
+    negative to begin with is left alone. Afterwards it is the number of attempts, negative where a lane was
+    refused.
     """
     for i in range(BLOCK):
         stepped = i < count and memory[base + status * BLOCK + i] >= 0.0
         memory[base + status * BLOCK + i] = 0.0 if stepped else -1.0
-        memory[base + left * BLOCK + i] = dt if stepped else 0.0
-        memory[base + wish * BLOCK + i] = dt if stepped else 0.0
+        length = memory[base + span * BLOCK + i] if stepped else 0.0
+        memory[base + left * BLOCK + i] = memory[base + wish * BLOCK + i] = length
     over = 1
     for first in range(0, count, LANES):
-        over &= attempt(memory, base + first, dt, order, tolerance)
-    return 0 if over else rest(memory, base, count, dt, order)
+        over &= attempt(memory, base + first, order, tolerance)
+    return 0 if over else rest(memory, base, count, order)
 
 
-def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
+def _rest(memory, base, count, order):  # type: ignore[no-untyped-def]
     """Continue with the lanes that are not done, side by side; return how many were refused."""
     rows = memory[base + bounds * BLOCK :]  # the last row has the lanes' numbers
     going = refused = 0
@@ -78,14 +79,16 @@ def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
         rows[left * BLOCK + i] = 0.0
     while going > 0:
         for first in range(0, going, LANES):
-            attempt(rows, first, dt, order, tolerance)
+            attempt(rows, first, order, tolerance)
         kept = 0
         for i in range(going):
             lane = base + np.int64(rows[bounds * BLOCK + i])
             if not rows[left * BLOCK + i] > 0.0:
                 for r in range(q, left):
                     memory[lane + r * BLOCK] = rows[r * BLOCK + i]
-            elif rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt:
+            elif rows[status * BLOCK + i] >= LARGEST_COUNT or not (
+                rows[wish * BLOCK + i] > SMALLEST_PART * rows[span * BLOCK + i]
+            ):
                 memory[lane + status * BLOCK] = -rows[status * BLOCK + i]
                 refused += 1
             else:
@@ -106,6 +109,7 @@ def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, Any]:
         "status": layout.status,
         "left": layout.left,
         "wish": layout.wish,
+        "span": layout.span,
         "bounds": layout.bounds,
         "size": layout.rows,
         "tolerance": tolerance,
@@ -135,7 +139,7 @@ def lanes(record: SeriesRecord) -> int:
 def compile_advance_block(
     record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True, width: int | None = None
 ) -> Callable:
-    """Compile ``advance(memory, base, count, dt, order)``, see `_advance_block`.
+    """Compile ``advance(memory, base, count, order)``, see `_advance_block`.
 
     Parameters
     ----------
@@ -162,10 +166,10 @@ def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     Where the step is `GUIDED`, they differ in their constants.
     """
     rows[status] = 0.0
-    rows[left] = rows[wish] = dt
+    rows[left] = rows[wish] = rows[span] = dt
     while rows[left] > 0.0:
         before = rows[left]
-        attempt(rows, 0, dt, order, tolerance)
+        attempt(rows, 0, order, tolerance)
         if rows[left] < before:
             slopes[status] = dt - before
             slopes[status + 1] = before - rows[left]

@@ -446,8 +446,7 @@ class StepCode:
     constants : list of str
         Names of the constants that the code uses.
     rows : list of str
-        Rows of a lane that the block function reads and writes: inputs, then places and velocities, then the
-        status, then rows that it fills itself.
+        Rows of a lane that the block function reads and writes: those of `LaneLayout`, then room.
     """
 
     def __init__(
@@ -511,8 +510,8 @@ class StepCode:
             and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
         ]
         #: Rows that must be filled in before the step.
-        self.given = [*self._inputs, *q, *v, "status"]
-        own = [*self.given, "left", "wish"]
+        self.given = [*self._inputs, *q, *v, "status", "span"]
+        own = [*self._inputs, *q, *v, "status", "left", "wish", "span"]
         self.rows = [*own, *(f"rest_{name}" for name in own), "rest_lane"]
         #: Those of them that are read after the step.
         self.results = [*q, *v, "status"]
@@ -583,7 +582,7 @@ class StepCode:
         return self.compile_simulate()
 
     def compile_block(self, tolerance: float = TOLERANCE) -> Callable:
-        """Compile ``advance_block(memory, base, count, dt, order)`` on `rows` of BLOCK lanes."""
+        """Compile ``advance_block(memory, base, count, order)`` on `rows` of BLOCK lanes."""
         from lag_envs.stepping.driver import compile_advance_block
 
         return compile_advance_block(self.record, tolerance, self._fused)

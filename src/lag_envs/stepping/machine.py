@@ -48,8 +48,9 @@ class LaneLayout:
         The first place and the first velocity.
     status : int
         The number of attempts, negative where the lane is not stepped.
-    left, wish : int
-        What is left of the control step, 0 where it is done, and the step that is wished for [s].
+    left, wish, span : int
+        What is left of the control step, 0 where it is done; the step that is wished for; the control step's
+        length [s].
     bounds : int
         Sums of the bounds on what places and velocities leave out; a single lane has them.
     rows : int
@@ -61,7 +62,8 @@ class LaneLayout:
         self.inputs = {name: i for i, name in enumerate(record.given)}
         self.q = len(self.inputs)
         self.v, self.status = self.q + n, self.q + 2 * n
-        self.left, self.wish, self.bounds = self.status + 1, self.status + 2, self.status + 3
+        self.left, self.wish, self.span = (self.status + i for i in (1, 2, 3))
+        self.bounds = self.span + 1
         self.rows = self.bounds + 2 * n
 
 
@@ -323,7 +325,7 @@ def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
 
 @cache
 def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
-    """Return ``attempt(rows, at, dt, order, tolerance)``, to be called from compiled code.
+    """Return ``attempt(rows, at, order, tolerance)``, to be called from compiled code.
 
     It takes a step of each lane for which something is left, of the length that is wished for or of a part of
     it, and replaces places, velocities, status, `left` and `wish` in the rows of `LaneLayout`, which begin at
@@ -340,7 +342,7 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
         Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {lanes} {fused}".encode()).hexdigest()[:16]
-    kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE])
+    kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _INT, _DOUBLE])
     return _linked(
         f"attempt_{digest}", kind, lambda module, name: _write(module, name, kind, record, lanes, fused)
     )
@@ -349,12 +351,12 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
 def _write(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, lanes: int, fused: bool
 ) -> ir.Function:
-    """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
+    """Write the function ``name(rows, order, tolerance)`` into a module."""
     step, layout, n = Series(record), LaneLayout(record), record.size
     function = ir.Function(module, kind, name)
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
-    rows, dt, order, tolerance = function.args
+    rows, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     t = Machine(builder, step.slots * STRIDE, lanes, fused)
     apart = 1 if lanes == 1 else BLOCK
@@ -370,13 +372,10 @@ def _write(
     def write(row: int, value: ir.Value) -> None:
         builder.store(value, pointer(row)).align = 8
 
-    def splat(value: ir.Value) -> ir.Value:
-        return value if lanes == 1 else primitives.splat(builder, value, lanes)
-
     inputs = {name: read(row) for name, row in layout.inputs.items()}
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
     before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
-    lane, bounds = step.substep(t, inputs, before, splat(dt), order, splat(tolerance))
+    lane, bounds = step.substep(t, inputs, before, read(layout.span), order, t.broadcast(tolerance))
     for i in range(n):
         write(layout.q + i, lane.q[i])
         write(layout.v + i, lane.v[i])
@@ -509,7 +508,8 @@ def _write_pull(
     before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
     bars = [read(layout.bounds + i) for i in range(2 * n + len(sources))]
     lane, bars, back = step.pull(t, inputs, before, t.broadcast(dt), order, t.broadcast(tolerance), bars)
-    for row, value in enumerate([*lane.q, *lane.v, *lane[2:], *bars], layout.q):
-        builder.store(value, pointer(row)).align = 8
+    for first, values in ((layout.q, [*lane.q, *lane.v, *lane[2:]]), (layout.bounds, bars)):
+        for row, value in enumerate(values, first):
+            builder.store(value, pointer(row)).align = 8
     builder.ret(builder.zext(back, _INT))
     return function

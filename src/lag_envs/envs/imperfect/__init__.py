@@ -5,10 +5,8 @@ a batch, like parameters that differ within any batch (`drawn`). Noise, pushes, 
 control steps change the command before a step and what is shown after it, in loops of their own (`whole`);
 with a lag the step between is that of `lagged`.
 
-With other imperfections (`divided`) one function takes a control step on the rows of one environment. The
-single environment calls it on its own rows, a batch on those of each environment in turn, so both have the
-same bits. Within a step the command in force may change, and the state that a late sensor shows may lie
-inside the step: it is divided at these times, and nowhere else.
+With other delays the command in force may change within a step, and the state that a late sensor shows may
+lie inside it: the step is divided at these times, and nowhere else (`divided`).
 
 Draws come from the same generator as starts and kicks, with a key for each purpose, derived from that of the
 episode.

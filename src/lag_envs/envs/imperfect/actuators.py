@@ -97,22 +97,20 @@ class Actuators:
         ]
 
     def delay(self, rows: RowsWithRings) -> list[str]:
-        """Return the lines that replace a command by the one in force, if all are late by whole steps."""
-        return rows.turn(self.ring, self._sent, self._sent) if self.ring.slots else []
+        """Return the lines that replace a command by the one in force, or send it, if that changes in a step.
 
-    def send(self, rows: RowsWithRings) -> list[str]:
-        """Return the lines that send a command, if it is delayed by parts of a step."""
+        Where all are late by whole steps, a command of an earlier step is in force throughout.
+        """
         if not self.ring.slots:
             return []
+        if self._options.whole:
+            return rows.turn(self.ring, self._sent, self._sent)
         low, high = self._constants["late_low"], self._constants["late_high"]
         shortest, longest = self._options.action_delay
         draw = f" + ({high} - {low}) * uniform({purpose_key('delay')}, np.uint64(n), np.uint64(0))"
         late = f"{low}{draw if shortest < longest else ''}"
-        return [
-            "now = np.int64(n)",
-            f"slot = now % {self.ring.slots}",
-            *rows.put(self.ring, self._sent | {"at": late}),
-        ]
+        slot = f"slot = {rows.whole('n')} % {rows.whole(self.ring.slots)}"
+        return [slot, *rows.put(self.ring, self._sent | {"at": late})]
 
     def choose(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that find the command in force at `t`, and when the next one takes effect.
@@ -124,7 +122,7 @@ class Actuators:
             return []
         return [
             f"for back in range({ring.slots}):",
-            f"    slot = (now + {ring.slots} - back) % {ring.slots}",
+            f"    slot = {rows.whole(f'(np.int64(n) + {ring.slots} - back) % {ring.slots}')}",
             f"    comes = ({rows.in_slot(ring, 'at')} - back) * k_dt",
             "    if comes <= t:", "        break",
             "    if comes < switch:", "        switch = comes",

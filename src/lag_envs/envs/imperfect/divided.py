@@ -1,256 +1,187 @@
-"""Steps that imperfect sensors or actuators divide, one environment at a time."""
+"""Steps that imperfect sensors or actuators divide: commands change, or observations are taken, within them.
+
+A step is moved piece by piece. A piece ends where a command comes into force, an observation is taken, or the
+step is over. In a batch each environment has pieces of its own, and all go on side by side until the one with
+the most pieces is done.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from typing import Any
 
-from lag_envs.envs import sharing
-from lag_envs.envs.imperfect.actuators import Actuators
-from lag_envs.envs.imperfect.drawn import DrawnProgram
-from lag_envs.envs.imperfect.lagged import lagged_code
-from lag_envs.envs.imperfect.motion import Held, Lagged
 from lag_envs.envs.imperfect.rows import RowsWithRings
-from lag_envs.envs.imperfect.sensors import Sensors
-from lag_envs.envs.lines import compiled_lines, indent, next_episode
-from lag_envs.envs.program import SLOW
-from lag_envs.stepping.compiling import BLOCK
-from lag_envs.stepping.rows import Rows
-from lag_envs.tasks.base import Task
+from lag_envs.envs.imperfect.whole import WholeProgram
+from lag_envs.envs.lines import indent, indented
+
+_LANE = "for i in range(size):"
 
 
-class DividedProgram(DrawnProgram):
-    """The compiled functions of a task with imperfections; the arguments are those of `Program`.
+class DividedProgram(WholeProgram):
+    """The compiled functions of a task with imperfections that divide steps; the arguments are `Program`'s.
 
-    The further rows that it keeps are those of `Sensors` and `Actuators`.
+    Within a step, `t` is the time since its start, `switch` the time at which the commands ``u`` change,
+    `end` that of the piece's end. The rows ``z`` hold the state at `t`, the rows ``mean_u`` sum up what the
+    reward takes as controls, the rows ``now_u`` hold lagging controls.
     """
-
-    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
-        super().__init__(task, absent, varying)
-        self.scratch = [*self.a, *self.o, *self.held]
-        self._where = RowsWithRings(self.kept, "f", "base", "stride")
-        self._lane = Rows(self.kept, "f", "base", BLOCK)
-        self._work = Rows(self.scratch, "work", "0", 1)
-
-    @property
-    def _printed(self) -> list[str]:
-        inside = (self._actuators.perturb, self._sensors.sense, [self._sensors.due], self._sensors.divide)
-        commands = (self._actuators.at_rest, self._actuators.command)
-        more = (*inside, *commands, ["k_late_low k_late_high"], self._motion.constants)
-        return [*super()._printed, *(line for part in more for line in part)]
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         super()._record(formulas, constants)
-        found, scene, trace = self.options, self._source.scene, formulas.trace
-        self._sensors = Sensors(found, self.o, self.observe, self._bounded, constants, trace)
-        self._actuators = Actuators(found, formulas, self.a, self.y, self.u, self.clip, constants)
-        self._add_pushes(constants)
-        self._lagged: Any = None
-        self._motion: Held | Lagged
-        if found.lag:
-            self._lagged = lagged_code(scene, constants)
-            lift = formulas.lift("z")
-            self._motion = Lagged(self._lagged, lift, self.n_state, self.y, self.z, self.u, constants)
-        else:
-            self._motion = Held(self._stepper, self.y, self.z, self.u, self._x)
-        sensors, actuators = self._sensors, self._actuators
-        self.own = [
-            *self.own, *actuators.reached, *sensors.shown, *actuators.ring.names, *sensors.ring.names,
-        ]  # fmt: skip
+        self._mean = [f"mean_{u}" for u in self.u]
+        self._now = [f"now_{u}" for u in self.in_force]
+        taken = self._sensors.taken
+        self.passing = ["t", "switch", "end", "moved", "failed", *self._mean, *self._now, *taken]
+        bound = [] if self.general else [f"x = {self._x} * (dt / k_dt)" if self._x else "x = 0.0"]
+        #: The lines that say for how long a piece lasts, to the lines that move it.
+        self._span = ["dt = end - t", *bound]
 
     @property
-    def order_constant(self) -> str | None:
-        """See `Program.order_constant`."""
-        return "lagged_order" if self._lagged else super().order_constant
+    def _printed(self) -> list[str]:
+        return [*super()._printed, *self._sensors.divide, "k_late_low k_late_high"]
 
     @property
     def tries_all(self) -> bool:
         """See `Program.tries_all`."""
         return True
 
-    def _bound_observations(self) -> None:
-        """Leave observations unbounded: what the sensors show is bounded later."""
-
-    # --- one environment, alone or in a batch ---------------------------------------------------------------
+    def _choose(self, rows: RowsWithRings) -> list[str]:
+        """Return the lines that find the commands in force at `t`, and the end of the piece."""
+        mean = [] if self.in_force else [f"mean_{u} += (h / k_dt) * {u}" for u in self.u]
+        commands = [*self._actuators.choose(rows), "h = switch - t", *self._actuators.command, *mean]
+        return [
+            "if t == switch:", *indent(["switch = k_dt", *commands]),
+            "end = switch", *self._sensors.divide,
+        ]  # fmt: skip
 
     @property
-    def _rows_of_constants(self) -> list[str]:
-        return [f"k_{name}" for name in self.varying]
+    def _shares(self) -> list[tuple[str, str]]:
+        """What a piece adds to the mean controls, where actuators lag; else `_choose` adds it."""
+        return [(mean, f"(dt / k_dt) * {u}") for mean, u in zip(self._mean, self.means, strict=False)]
 
-    @cached_property
-    def take(self) -> Callable:
-        """``take(f, base, stride, par, work, room, key)`` to (reward, over): a step of one environment.
-
-        `work` holds the action; it receives the shown observation, or the controls of a refused step.
-        """
-        rows, actuators, sensors = self._where, self._actuators, self._sensors
-        body = [
-            *self._parameters(),
-            *rows.load([*self._rows_of_constants, *self.y, *self.g, *actuators.reached, "n"]),
-            *self._work.load(self.a), *actuators.perturb, *actuators.send(rows), *self._through,
-            *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
-            "n = n + 1.0", *self.kick, *self.move,
-            "if n >= k_limit:", "    over = over + 2.0",
-            *sensors.read(rows),
-            *rows.load(sensors.shown), *self._work.store(self.o, sensors.shown),
-            *rows.store([*self.y, *actuators.reached, "n"]),
-            *rows.store(self.u, [f"last_{u}" for u in self.u]),
-            "return r, np.int64(over)",
-        ]  # fmt: skip
-        advance = self._lagged.compile() if self._lagged else self.advance
-        return compiled_lines("take", "f, base, stride, par, work, room, key", body, advance)
+    # --- one environment ------------------------------------------------------------------------------------
 
     @property
-    def _through(self) -> list[str]:
-        """The lines of a whole step: from ``y`` to ``z``, with the mean controls in ``u``."""
-        within, motion, actuators = self.options.within, self._motion, self._actuators
-        move = [
-            "h = end - t", *motion.move,
-            "if status < 0:",
-            *indent([*self._work.store(self.held, self.u), f"return 0.0, {SLOW}"]),
-            *motion.behind,
-            *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
-            "t = end",
+    def _move_one(self) -> list[str]:
+        begin = [f"begin_{y}" for y in self.y]
+        piece = [
+            *self._choose(self._single), *_assigned(self.reaching, self.reached),
+            *self._span, *self._stepper.any_step, *indented("if status < 0:", self._leave_one),
+            *(f"{mean} += {share}" for mean, share in self._shares),
+            *_assigned(self.in_force, self.in_force_after), *_assigned(self.y, self.z),
+            "t = end", *self._sensors.watch(self._single),
         ]  # fmt: skip
-        # If nothing changes within the step it is one piece, and its mean control is the control itself.
-        whole = ["h, t, end = k_dt, 0.0, k_dt", *actuators.command, *motion.mean, *move]
-        commands = [*actuators.choose(self._where), "h = switch - t", *actuators.command, *motion.mean]
-        pieces = [
-            "t, switch = 0.0, 0.0",
-            "while t < k_dt:",
+        return [
+            *_assigned(begin, self.y), *(f"{mean} = 0.0" for mean in self._mean),
+            *([self._room_one] if self.general else []),
+            "t, switch = 0.0, 0.0", *indented("while t < k_dt:", piece),
+            *self._one.store(self.u, self.in_force_after or self.u),
+            *_assigned(self.u, self._mean), *_assigned(self.y, begin),
+        ]  # fmt: skip
+
+    # --- a batch --------------------------------------------------------------------------------------------
+
+    @property
+    def _move_lanes(self) -> list[str]:
+        look = self._look
+        return [
+            *indented(_LANE, self._begin_step),
+            "pieces = np.uint64(1)",
+            "while pieces > 0:",
             *indent([
-                "if t == switch:", *indent(["switch = k_dt", *commands]),
-                "end = switch",
-                *self._sensors.divide,
-                *move,
-                *self._sensors.watch(self._where),
+                "pieces = np.uint64(0)",
+                *indented(_LANE, self._begin_piece),
+                *(self._move_by_series if self.general else self._move_by_flow),
+                *(indented(_LANE, look) if look else []),
             ]),
         ]  # fmt: skip
+
+    @property
+    def _begin_step(self) -> list[str]:
+        # An environment that is to be restarted has no piece.
+        zeros = ["switch", "failed", *self._mean]
         return [
-            *(f"b_{y} = {y}" for y in self.y), *(f"mean_{u} = 0.0" for u in self.u),
-            *motion.begin(self._where),
-            *(pieces if within or actuators.ring.slots else whole),
-            *(f"{y} = b_{y}" for y in self.y),
-            *(f"last_{u}, {u} = {now}, mean_{u}" for u, now in zip(self.u, motion.reached, strict=True)),
+            *self._load([*self.y, *self.reached, "n"]), *self._in_force,
+            "t, zero = select(n < 0.0, k_dt, 0.0), 0.0",
+            *self._store(["t", *zeros], ["t", *["zero"] * len(zeros)]),
+            *self._store([*self.z, *self.reaching, *self._now], [*self.y, *self.reached, *self.in_force]),
         ]  # fmt: skip
 
     @property
-    def room(self) -> int:
-        """Numbers that the series needs."""
-        return self._lagged.scratch if self._lagged else super().room
-
-    @cached_property
-    def launch(self) -> Callable:
-        """``launch(f, base, stride, par, key, state_given, target_given)``: begin an episode."""
-        rows, actuators = self._where, self._actuators
-        undrawn = [row for row in self._rows_of_constants if row not in self.drawn]
-        body = [
-            *self._parameters(),
-            *rows.load([*undrawn, *self.y[: self.n_state], *self.g]),
-            *self._start, *actuators.begin(rows), *self._sensors.begin(rows),
-            *rows.store([*self.y, *self.g, *self.u, *actuators.reached, "n", *self.drawn]),
-        ]  # fmt: skip
-        return compiled_lines("launch", "f, base, stride, par, key, state_given, target_given", body)
-
-    # --- the functions of `Program` ------------------------------------------------------------------------
-
-    def _slices(self, at: int, work: int) -> list[str]:
-        """Return the lines that cut constants, working memory of a step and of the series out of an array."""
+    def _load_piece(self) -> list[str]:
+        """The lines that load what a piece starts from."""
+        constants = [f"k_{name}" for name in self.varying]
         return [
-            f"par = memory[{at}:]",
-            f"work = memory[{work}:]",
-            f"room = memory[{max(at + len(self.uniform), work + len(self.scratch))}:]",
-        ]
-
-    @cached_property
-    def step_one(self) -> Callable:
-        """See `Program.step_one`."""
-        first, n = len(self.kept), len(self.a)
-        body = [
-            "memory = f", *self._slices(first + len(self.scratch), first),
-            *self._work.store(self.a, ["a"] if n == 1 else [f"a[{i}]" for i in range(n)]),
-            "r, over = take(f, np.int64(0), np.int64(1), par, work, room, ids[2])",
-            *self._work.load(self.o), *self._shown_one.store(self.o),
-            "return r, over",
+            *self._load([*constants, "n", "t", "switch", "end", "failed", *self._mean]),
+            *self._load(self.z, self.y), *self._load(self._commands, self.u),
+            *self._load(self._now, self.in_force),
         ]  # fmt: skip
-        return compiled_lines("step_one", "f, obs, a, ids", body, self.take)
-
-    @cached_property
-    def start_one(self) -> Callable:
-        """See `Program.start_one`."""
-        first = len(self.kept)
-        body = [
-            "memory = f", *self._slices(first + len(self.scratch), first), *next_episode("0", "1", "2"),
-            "launch(f, np.int64(0), np.int64(1), par, key, state_given, target_given)",
-            *self._one.load(self._sensors.shown), *self._shown_one.store(self.o, self._sensors.shown),
-        ]  # fmt: skip
-        return compiled_lines("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
-
-    def _each(self, body: Sequence[str]) -> list[str]:
-        """Return the loop over the environments of a block."""
-        return [
-            "for lane in range(np.int64(first), np.int64(first + size)):",
-            f"    base = (lane // {BLOCK}) * {BLOCK * len(self.kept)} + lane % {BLOCK}",
-            *indent(body),
-        ]
 
     @property
-    def _show(self) -> list[str]:
-        shown = self._sensors.shown
-        return [*self._lane.load(shown), *Rows(self.o, "obs", "lane", "count").store(self.o, shown)]
+    def _begin_piece(self) -> list[str]:
+        body = [
+            self._key, *self._load_piece,
+            *self._load(self.a), *self._load(self.reaching, self.reached),
+            *self._choose(self._lane),
+            *self._store(["switch", "end", *self._mean]),
+            *self._store([*self._commands, *self.reaching], [*self.u, *self.reached]),
+        ]  # fmt: skip
+        return [*self._load(["t"]), *indented("if t < k_dt:", body)]
 
     @property
-    def room_of_all(self) -> int:
-        """Numbers that `step_all` needs after the constants."""
-        return len(self.scratch) + self.room
+    def _move_by_series(self) -> list[str]:
+        going = "going = t < k_dt"
+        given = ["span, status = select(going, end - t, 0.0), select(going, 0.0, -1.0)"]
+        found = [
+            "moved = select(going & (status > 0.0), 1.0, 0.0)",
+            "failed = select(going & (status < 0.0), 1.0, failed)",
+        ]
+        end = [*self._load_piece, going, *self._span, *self._advanced, *found, *self._end_piece]
+        return [*self._advance_lanes([*self._load_piece, going, *given]), *indented(_LANE, end)]
 
-    @cached_property
-    def step_blocks(self) -> Callable:
-        """See `Program.step_blocks`."""
-        n, stride = len(self.a), f"np.int64({BLOCK})"
-        step = [
-            *self._work.store(self.a, [f"action[lane * {n} + {j}]" for j in range(n)]),
-            f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
-            f"if over == {SLOW}:",
-            "    refused, over = max(refused, np.uint64(lane + 1)), 0",
-            *indent([*self._work.load(self.held), *self._lane.store(self.asked or self.u, self.held)]),
-            "if over > 0:",
-            *indent([*self._lane.store(["n"], ["-np.float64(over)"]), "overs += np.uint64(1)"]),
-        ]
-        restart = [
-            *next_episode("lane", "count + lane", "2 * count + lane"),
-            f"launch(f, base, {stride}, par, key, False, False)",
-            "r, over = 0.0, 0",
-        ]
-        body = [
-            "memory = par", *self._slices(0, len(self.uniform)),
-            *self._claimed(self._each([
-                *self._lane.load(["n"]), "if n < 0.0:", *indent(restart), "else:", *indent(step),
-                "reward[lane] = r",
-                "terminated[lane] = (over == 1) | (over == 3)", "truncated[lane] = over >= 2",
-                *self._show,
-            ])),
+    @property
+    def _move_by_flow(self) -> list[str]:
+        # What the fast formula does not cover is moved by the second loop.
+        fast = ["moved = select(t < k_dt, select(within, 1.0, 2.0), 0.0)"]
+        slow = ["moved = select(status < 0, 0.0, 1.0)", "failed = 1.0 - moved"]
+        first = [*self._load_piece, *self._span, *self._stepper.fast, *fast, *self._end_piece]
+        second = [*self._load_piece, *self._span, *self._stepper.any_step, *slow, *self._end_piece]
+        return [
+            *indented(_LANE, first),
+            *indented(_LANE, [*self._load(["moved"]), *indented("if moved == 2.0:", second)]),
         ]  # fmt: skip
-        helpers = self.take, self.launch, *sharing.claiming()
-        return compiled_lines("step_blocks", sharing.STEP_BLOCKS, body, *helpers, inner=True)
 
-    @cached_property
-    def start_all(self) -> Callable:
-        """See `Program.start_all`."""
-        begin = [
-            *next_episode("lane", "count + lane", "2 * count + lane"),
-            f"launch(f, base, np.int64({BLOCK}), par, key, state_given, target_given)",
-        ]
-        body = [
-            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
-            *indent([
-                *self._place,
-                *self._each([
-                    "if mask[lane]:", *indent(begin),
-                    "if mask[lane] or whole:", *indent(self._show),
-                ]),
-            ]),
+    @property
+    def _end_piece(self) -> list[str]:
+        """The lines that keep the end of a piece if ``moved`` is 1, and end the step if it was refused."""
+        pairs = zip([*self.y, *self.in_force], [*self.z, *self.in_force_after], strict=True)
+        return [
+            *(f"{before} = select(moved == 1.0, {after}, {before})" for before, after in pairs),
+            *(f"{mean} = select(moved == 1.0, {mean} + {share}, {mean})" for mean, share in self._shares),
+            "t = select(failed == 1.0, k_dt, select(moved == 1.0, end, t))",
+            *self._store([*self.z, *self._now], [*self.y, *self.in_force]),
+            *self._store(["t", "moved", "failed", *self._mean]),
+            "pieces += np.uint64(t < k_dt)",
         ]  # fmt: skip
-        arguments = "f, ids, par, obs, mask, whole, state_given, target_given, count"
-        return compiled_lines("start_all", arguments, body, self.launch)
+
+    @property
+    def _look(self) -> list[str]:
+        """The lines that take an observation at the end of a piece."""
+        watch, taken = self._sensors.watch(self._lane), self._sensors.taken
+        body = [self._key, *self._load_piece, *self._load([*self.g, *taken]), *watch, *self._store(taken)]
+        return [*self._load(["moved"]), *indented("if moved == 1.0:", body)] if watch else []
+
+    @property
+    def _moved(self) -> list[str]:
+        return [*self._again, "within = failed == 0.0"]
+
+    @property
+    def _again(self) -> list[str]:
+        return [
+            *self._load([*self.z, "failed"]), *self._load(self._mean, self.u),
+            *self._in_force, *self._load(self._now, self.in_force_after),
+            "status = -failed",
+        ]  # fmt: skip
+
+
+def _assigned(names: Sequence[str], values: Sequence[str]) -> list[str]:
+    return [f"{name} = {value}" for name, value in zip(names, values, strict=True)]

@@ -46,7 +46,7 @@ class LaggedCode:
         self.start, self.end = start, end
         self.in_force = [f"reached{i}" for i in n]
         self.in_force_after = [f"u{i}_end" for i in n]
-        self.means = [f"u{i} = u{i}_mean" for i in n]
+        self.means = [f"u{i}_mean" for i in n]
         self._names = {name: name.replace("k_", "k_lagged_", 1) for name in code.constants}
         for i in n:
             decay = str(constants[f"decay{i}"])

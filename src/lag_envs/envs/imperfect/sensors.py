@@ -46,6 +46,9 @@ class Sensors:
         #: Whether a reading is due after step ``n``; empty if one always is.
         self.due = f"np.floor(n / {every}) * {every} == n" if options.observation_every > 1 else ""
         self.shown = [f"h{i}" for i in range(len(observed))]
+        #: The observation taken within a step, if all are of one age; else it goes to its slot at once.
+        single = options.within and not options.jittered
+        self.taken = [f"m{i}" for i in range(len(observed))] if single else []
         self._seen = {f"seen{i}": o for i, o in enumerate(observed)}
         self.ring = Ring([*self._seen], options.readings)
         sigmas = {f"sigma{i}": x for i, x in enumerate(options.observation_noise)}
@@ -62,11 +65,13 @@ class Sensors:
     def watch(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that store, at the end of a piece, what will be shown later."""
         if self._options.jittered:
-            slot = f"slot = (np.int64(n) + coming) % {self.ring.slots}"
+            slot = f"slot = {rows.whole(f'(np.int64(n) + coming) % {self.ring.slots}')}"
             store = [*self._observe, slot, *rows.put(self.ring, self._seen)]
             return self._each_coming(["if t == seen_at:", *indent(store)])
-        seen = [*self._observe, *(f"m{i} = {o}" for i, o in enumerate(self._o))]
-        return ["if t == k_shown_at:", *indent(seen)] if self._options.within else []
+        if not self.taken:
+            return []
+        seen = [*self._observe, *(f"{m} = {o}" for m, o in zip(self.taken, self._o, strict=True))]
+        return ["if t == k_shown_at:", *indent(seen)]
 
     def _each_coming(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the readings to come, each of its own age, that may be taken in this step.
@@ -74,8 +79,8 @@ class Sensors:
         One of age 0 is taken at the step's end, none at its beginning, which was the end of the last.
         """
         lines = [
-            "share = uniform(key_age, np.uint64(n + coming), np.uint64(0))",
-            f"seen_at = (coming - ({self._low} + ({self._high} - {self._low}) * share)) * k_dt",
+            "part = uniform(key_age, np.uint64(n + coming), np.uint64(0))",
+            f"seen_at = (coming - ({self._low} + ({self._high} - {self._low}) * part)) * k_dt",
             *body,
         ]
         return [
@@ -97,8 +102,9 @@ class Sensors:
     def delay(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that replace the observation by the one to be shown now, if sensors are late."""
         if self._options.jittered:
-            return [f"slot = np.int64(n) % {self.ring.slots}", *rows.take(self.ring, self._seen)]
-        taken = {row: f"m{i}" for i, row in enumerate(self._seen)} if self._options.within else self._seen
+            slot = f"slot = {rows.whole('n')} % {rows.whole(self.ring.slots)}"
+            return [slot, *rows.take(self.ring, self._seen)]
+        taken = dict(zip(self._seen, self.taken, strict=True)) if self.taken else self._seen
         return rows.turn(self.ring, taken, self._seen) if self.ring.slots else []
 
     def _show(self, rows: RowsWithRings) -> list[str]:

@@ -1,4 +1,4 @@
-"""Steps during which no command changes and no sensor reads, so that a batch is stepped side by side."""
+"""Steps between imperfect actuators and sensors: commands before, observations after the whole step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lag_envs.tasks.base import Task
 class WholeProgram(DrawnProgram):
     """The compiled functions of a task with imperfections that divide no step; see `Imperfections.whole`.
 
-    The further rows that it keeps are those of `Sensors` and `Actuators`.
+    The arguments are those of `Program`. Its further rows are those of `Sensors` and `Actuators`.
     """
 
     sensing = True
@@ -98,7 +98,7 @@ class WholeProgram(DrawnProgram):
             # Not side by side: each environment has its own slot. One that is to be restarted has none.
             *(
                 indented(lane, [
-                    *self._load(["n"]),
+                    self._key, *self._load(["n"]),
                     "if n >= 0.0:", *indent([*self._load(self.a), *delay, *self._store(self.a)]),
                 ])
                 if delay
@@ -123,7 +123,9 @@ class WholeProgram(DrawnProgram):
             *(
                 indented(lane, [
                     *ordinary, "if ordinary == 1.0:",
-                    *indent([*clock, *self._load(self.o), *delay, *self._store(self.o)]),
+                    *indent([
+                        *clock, *self._load([*self.o, *sensors.taken]), *delay, *self._store(self.o),
+                    ]),
                 ])
                 if delay
                 else []
