@@ -168,6 +168,12 @@ class SwingUp(GuardedTrack, _ChainTask):
             "reward_scale": 1.0, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
             "first_layer_scale": 3.0,
         },
+        # Many steps for each update: it takes a while until a swing ends upright for the first time.
+        "td3": {
+            "n_timesteps": 2e6, "n_envs": 128, "n_steps": 3, "gamma": 0.97, "gradient_steps": 8,
+            "buffer_size": 1_000_000, "learning_rate": "lin_2e-3",
+            "policy_kwargs": {"net_arch": [64, 64], "noise": 0.3, "noise_steps": 4},
+        },
     }  # fmt: skip
     note = """
 The best known method plans anew for each start. One recorded plan with time-varying feedback is nearly as
