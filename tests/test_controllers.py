@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
+import own_tasks
 import pytest
 from covering import covering, engine, quick, slow
 from rollouts import SINGLE
@@ -22,13 +23,17 @@ from lag_envs.controllers import (
     make_controller,
 )  # fmt: skip
 from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.linear import Regulator, time_varying
 from lag_envs.controllers.lookahead import LookAhead
+from lag_envs.controllers.mpc import MPC
 from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergyShapingLQR
+from lag_envs.controllers.tracking import Tracking
 from lag_envs.envs.model import Model
+from lag_envs.envs.single import LagrangianEnv
 from lag_envs.evaluation.rollout import play
 from lag_envs.scenes.derivation import form_of
 from lag_envs.scores import known_returns, score
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks import TASKS, cart_pole, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.registration import make_task
 
 SEED = 1_000_000_000
@@ -215,11 +220,46 @@ def test_unknown_names_get_hints():
         make_controller(BALANCE, "LQR", weight=1.0)
 
 
+class Lopsided(cart_pole.CartPoleContinuous):
+    """The middle of its actions is not the force 0."""
+
+    id = ""
+    action = {"force": (-4.0, 16.0)}
+    draws = 0
+
+
+def test_feedback_along_a_plan_holds_a_rest_without_control():
+    task, weights = Lopsided(), {"x": 0.1, "theta": 1.0}
+    gains, last = time_varying(task, np.zeros((1, 4)), np.empty(0), [0.0] * 4, weights, 1e-3)
+    agent = Tracking(task, states=np.zeros((1, 4)), actions=[], gains=gains, rest=[0.0] * 4, hold=last)
+    env = LagrangianEnv(Lopsided)
+    for controller in (agent, agent.mirrored()):
+        seen, _ = env.reset(options={"state": [0.0] * 4})
+        action, _ = controller.predict(seen, None, True)
+        env.step(action)
+        assert abs(env.control) < 1e-6
+    np.testing.assert_allclose(agent.law(task).actions, [[-0.6]])
+    planner = MPC(task, horizon=3, guesses=1, iterations=1, budget=30)
+    blank = planner.predict(np.zeros(4, np.float32))[1]
+    assert planner.idle == pytest.approx(-0.6) and np.isfinite(blank.actions).all()
+
+
 def test_what_cannot_work_is_refused():
     with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 4\) for theta, theta_dot, psi_dot"):
         make_controller(SHELL, "LQR").predict(np.zeros(3))
     with pytest.raises(ValueError, match="Balance has random kicks"):
         ILQR(make_task(BALANCE), [Constant(0.0)])
+    for planner in (ILQR, MPC):
+        with pytest.raises(ValueError, match=r"takes one control .*; Deliver has 2 controls"):
+            planner(own_tasks.Deliver(), [])
+    with pytest.raises(ValueError, match="CartPoleExact has listed actions"):
+        ILQR(cart_pole.CartPoleExact(), [])
+    misspelt = {"thetta": 1.0}
+    for found in ({"weights": {}, "at": misspelt}, {"weights": misspelt}):
+        with pytest.raises(ValueError, match=r"(at|weights): there is no 'thetta'; did you mean theta"):
+            Regulator(cart_pole.CartPoleContinuous(), effort=1.0, **found)
+    with pytest.raises(ValueError, match=r"holds a rest .* from there theta_dot changes by 0\.1"):
+        Regulator(cart_pole.CartPoleContinuous(), weights={"x": 1.0}, effort=1.0, at={"theta": 0.5})
     with pytest.raises(ValueError, match="inertia=0"):
         make_controller(PUMP, "energy pump", inertia=0.0)
     for controller in (TiltLQR, ShellPD):

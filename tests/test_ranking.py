@@ -167,6 +167,14 @@ def test_columns_of_a_row():
     assert [row[key] for key in ("success", "settle", "effort", "often")] == [None] * 4
 
 
+def test_success_is_left_out_where_the_protocol_cannot_count_it():
+    result = {"policies": [{"returns": returns([1.0] * 40), "success": [False] * 40}]}
+    for env_id, task in TASKS.items():
+        if task.goal:
+            row = columns(env_id, result, 10, KNOWN, table([1.0] * 40))
+            assert (row["success"] is not None) == task.goal.counted
+
+
 # --- luck ---
 
 

@@ -82,7 +82,7 @@ def test_little_is_enough():
     pages, _ = render({"protocol": 1, "made": "today", "environments": boards})
     names = ["-index", "Gone-v0", "Gone-v0-protocol-0", "Gone-v0-protocol-0-A", "index", "index-2"]
     assert sorted(pages) == sorted([*(f"{name}.html" for name in names), "feed.xml"])
-    assert "No agent is ranked yet" in pages["Gone-v0.html"]
+    assert "This environment has no ranking" in pages["Gone-v0.html"]
     assert "protocol 0" in pages["Gone-v0-protocol-0.html"]
 
 

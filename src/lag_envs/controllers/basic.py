@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
+from lag_envs.errors import hint
 from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.formulas import Lifted, TaskFormulas
@@ -251,6 +252,25 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
     low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
     scale = 2.0 * formulas.largest / (high - low)
     return scale, -0.5 * scale * (high + low)
+
+
+def idle_actions(formulas: TaskFormulas) -> Array:
+    """Return the numbers of the actions that request no control."""
+    return np.zeros(formulas.actions) if formulas.choices else per_control(formulas)[1] + 0.0
+
+
+def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:
+    """Raise a ValueError for a name that is not among the known ones."""
+    for name in given:
+        if name not in known:
+            raise ValueError(f"{what}: there is no {name!r}; {hint(name, known)}")
+
+
+def check_single_control(what: str, task: Task) -> None:
+    """Raise a ValueError for a task that does not have one control with continuous actions."""
+    if task.formulas.choices or task.formulas.actions != 1:
+        has = "listed actions" if task.formulas.choices else f"{task.formulas.actions} controls"
+        raise ValueError(f"{what} takes one control with continuous actions; {type(task).__name__} has {has}")
 
 
 def hold_law(task: Task, rest: Array, gain: Array, read: ObservationDecoder) -> FeedbackLaw:

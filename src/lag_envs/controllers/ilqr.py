@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
+from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions, check_single_control
 from lag_envs.envs.model import REACH, Model
 from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
@@ -41,7 +41,7 @@ class ILQR:
     Parameters
     ----------
     task : Task
-        The task with its parameters, ``env.unwrapped.task``; one without random kicks.
+        The task with its parameters, ``env.unwrapped.task``; with one control and without random kicks.
     guesses : sequence of controllers
         Initial guesses; each is improved, and the best plan is played. `improve` alone needs none.
     after : controller, optional
@@ -72,6 +72,7 @@ class ILQR:
         iterations: int = 100,
         tolerance: float = 1e-3,
     ) -> None:
+        check_single_control("iLQR", task)
         if task.draws:
             raise ValueError(f"{type(task).__name__} has random kicks, which a plan does not foresee")
         self.task, self.guesses, self.tail = task, guesses, tail

@@ -14,7 +14,13 @@ import sympy
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from lag_envs.controllers.basic import FeedbackController, FeedbackLaw, hold_law
+from lag_envs.controllers.basic import (
+    FeedbackController,
+    FeedbackLaw,
+    check_names,
+    check_single_control,
+    hold_law,
+)
 from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
@@ -68,8 +74,10 @@ def regulator(
         Additional costs of a step of the task's own interval: weights of the squares of states, by name, and
         of "u".
     """
+    check_single_control("regulator", task)
     c = quadratic_cost(task, state, control, target)
     names = [*task.scene.state_names, "u"]
+    check_names("extra", extra or {}, names)
     for name, weight in (extra or {}).items():
         c[names.index(name), names.index(name)] += weight * task.dt / task.interval
     a, b = task.scene.jacobian(state, control, task.dt)
@@ -113,7 +121,9 @@ def time_varying(
     hold : ndarray, shape (n_state,)
         The same at rest.
     """
+    check_single_control("time_varying", task)
     scene = task.scene
+    check_names("weights", weights, scene.state_names)
     q, r = np.diag([weights.get(name, 0.0) for name in scene.state_names]), np.array([[effort]])
     unit = task.wanted([1.0]) - task.wanted([0.0])
     column = int(np.flatnonzero(unit[0])[0])
@@ -161,8 +171,11 @@ class Regulator(FeedbackController):
         at: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(task)
-        scene = task.scene
-        self.rest = np.array([(at or {}).get(name, 0.0) for name in scene.state_names])
+        scene, at = task.scene, at or {}
+        check_names("at", at, scene.state_names)
+        check_names("weights", weights, scene.state_names)
+        self.rest = np.array([at.get(name, 0.0) for name in scene.state_names])
+        self._check_rest(task)
         columns = [scene.control_names.index(a.control) for a in task.formulas.acting]
         a, b = scene.jacobian(self.rest, np.zeros(len(scene.control_names)), task.dt)
         b = b[:, columns]
@@ -170,6 +183,17 @@ class Regulator(FeedbackController):
         r = effort * np.diag(1.0 / np.atleast_1d(task.limit_control) ** 2)
         self.cost = solve_discrete_are(a, b, q, r)
         self.gain = np.linalg.solve(r + b.T @ self.cost @ b, b.T @ self.cost @ a)
+
+    def _check_rest(self, task: Task) -> None:
+        """Raise a ValueError where the state does not stay without control."""
+        scene = task.scene
+        (after,) = scene.simulate(self.rest, np.zeros((1, len(scene.control_names))), task.dt)[1:]
+        moved = np.abs(self.read.difference(after, self.rest))
+        if moved.max() > 1e-6 * max(1.0, np.abs(self.rest).max()):
+            raise ValueError(
+                f"at: the regulator holds a rest without control, but within a step from there "
+                f"{scene.state_names[moved.argmax()]} changes by {moved.max():.3g}"
+            )
 
     def off(self, state: Array) -> Array:
         """Return states relative to rest, by the shorter way around."""

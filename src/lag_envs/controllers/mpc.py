@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
+from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions, idle_actions
 from lag_envs.controllers.ilqr import ILQR, SHARES
 from lag_envs.controllers.tracking import waves
 from lag_envs.envs.model import Model
@@ -95,7 +95,7 @@ class MPC:
         self.task, self.horizon, self.every = task, horizon, min(every, horizon)
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
-        self.largest = task.formulas.largest
+        self.largest, self.idle = task.formulas.largest, idle_actions(task.formulas)[0]
         self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
         calm = without_kicks(task)
         self.model = Model(calm)
@@ -126,7 +126,7 @@ class MPC:
             state = Ahead(blank, blank, np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape))
         plan = state._replace(**{name: getattr(state, name).copy() for name in state._fields})
         plan.wait[:] = np.where(fresh, 0, np.maximum(plan.wait - 1, 0))
-        plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = 0.0, 0.0, x[fresh, None]
+        plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = self.idle, 0.0, x[fresh, None]
         rows, held = np.arange(n), np.zeros(n, np.bool_) if self.holds is None else self.holds(x)
         now = np.minimum(plan.step, self.horizon - 1)
         off = np.abs(self.read.difference(x, plan.states[rows, now])).max(axis=1)
@@ -167,7 +167,7 @@ class MPC:
             now = np.minimum(step, self.horizon - 1)
             off = self.read.difference(x, plan.states[rows, now])
             action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
-            after = 0.0 if self.hold is None else self.hold.act(x, targets, np.full(len(x), np.inf))
+            after = self.idle if self.hold is None else self.hold.act(x, targets, np.full(len(x), np.inf))
             actions[:, t] = np.where(step < self.horizon, action, after).clip(-self.largest, self.largest)
             x, _, _ = self.model(x, actions[:, t], self.planner.goals_for(targets, (len(x),)))
         return actions

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import FeedbackLaw, remade
+from lag_envs.controllers.basic import FeedbackLaw, idle_actions, remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -40,7 +40,7 @@ class Tracking(Clocked):
     gains : array_like, shape (steps, n_state) or (steps, n_actions, n_state)
         The feedback K_t, actions per deviation.
     rest : array_like, shape (n_state,)
-        The equilibrium to hold, with the action 0.
+        The equilibrium to hold, with no control.
     hold : array_like, shape (n_state,) or (n_actions, n_state)
         The feedback K there.
     """
@@ -63,6 +63,8 @@ class Tracking(Clocked):
         self.states, self.actions, self.gains, self.rest, self.hold = (
             np.asarray(values, np.float64) for values in (states, actions, gains, rest, hold)
         )
+        # Shaped as one step's actions.
+        self.idle = idle_actions(task.formulas).reshape(self.actions.shape[1:])
         steps = len(self.actions)
         for name, shape in self.shapes(task).items():
             wanted = tuple({"steps": steps, "steps + 1": steps + 1}.get(n, n) for n in shape)
@@ -105,8 +107,8 @@ class Tracking(Clocked):
     def mirrored(self) -> Tracking:
         """Return the plan's mirror image, for a task that looks the same from behind."""
         return Tracking(
-            self.task, states=-self.states, actions=-self.actions, gains=self.gains, rest=-self.rest,
-            hold=self.hold,
+            self.task, states=-self.states, actions=2.0 * self.idle - self.actions, gains=self.gains,
+            rest=-self.rest, hold=self.hold,
         )  # fmt: skip
 
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
@@ -119,7 +121,7 @@ class Tracking(Clocked):
         planned = np.where((step < steps)[:, None], planned, self.rest)
         gains = np.concatenate([self.gains, self.hold[None]])[step]
         off = self.read.difference(states, planned)
-        actions = np.concatenate([self.actions, np.zeros((1, *self.actions.shape[1:]))])[step]
+        actions = np.concatenate([self.actions, self.idle[None]])[step]
         return actions - np.einsum("i...j,ij->i...", gains, off)
 
     def law(self, task: Task) -> FeedbackLaw:
@@ -127,7 +129,7 @@ class Tracking(Clocked):
         m, n = task.formulas.actions, len(self.rest)
         return FeedbackLaw(
             np.append(self.states[:-1], self.rest[None], axis=0),
-            np.append(self.actions.reshape(-1, m), np.zeros((1, m)), axis=0),
+            np.append(self.actions.reshape(-1, m), self.idle.reshape(1, m), axis=0),
             np.append(self.gains.reshape(-1, m, n), self.hold.reshape(1, m, n), axis=0),
             self.read,
         )

@@ -247,7 +247,8 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     bare = np.array([p["returns"] for p in policies], np.float64)
     means = scores.table.mean(axis=1)
     settle, effort = (pooled(policies, name) for name in ("settle", "effort"))
-    success = pooled(policies, "success")
+    goal = TASKS[env_id].goal if env_id in TASKS else None
+    success = pooled(policies, "success") if goal is None or goal.counted else []
     counted = None
     if success:
         low, high = wilson(sum(success), len(success))

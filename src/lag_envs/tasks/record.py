@@ -31,6 +31,9 @@ class Goal:
     rules : int
         Version of the board's rules: 2 adds to its disturbances imperfect sensors and actuators, and hidden
         parameters. A board keeps the version that it began with.
+    counted : bool
+        Whether the board shows how many episodes succeed. Not if its protocol began with another rule:
+        stored results are never changed.
     """
 
     text: str
@@ -38,6 +41,7 @@ class Goal:
     terminated: bool | None = False
     arrival: str = ""
     rules: int = 2
+    counted: bool = True
 
 
 @dataclass(frozen=True)
