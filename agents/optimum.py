@@ -79,6 +79,8 @@ A task with plans (`Task.plans`) is planned instead, by iLQR from random guesses
                 what both get, by python -m agents.scale: means over fresh starts with standard errors; the
                 best of them is the best known, a lower bound
 With --quick plans of one seed are written to FOLDER and nothing is measured.
+Of a task with neither grid nor plans, the controllers and the best policy that ships with the package, or a
+run's, are measured by python -m agents.scale; with --quick nothing is written.
 
 Of a state of 4 dimensions an easier task is solved, such as the one without a track: its value is from above;
 lower is what the best agent gets, see the agents' results.
@@ -371,8 +373,7 @@ def scene_numbers(task: Task) -> dict[str, float]:
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
     """Solve the problems that an environment needs, and return its numbers."""
     own = TASKS[env_id].value_iteration
-    if own is None:
-        raise UserError(f"{env_id} has no grid to solve on; give its task a value_iteration")
+    assert own is not None
     source = own.relaxed or env_id
     problem = solvable()[source]
     levels = [problem.levels[0] / 2, problem.levels[0]] if quick else list(problem.levels)
@@ -551,9 +552,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # Tasks that serve as relaxations of others are solved first.
         known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
-        able = [env_id for env_id, problem in known.items() if problem or TASKS[env_id].plans is not None]
-        last = {env_id for env_id in able if known[env_id] and known[env_id].relaxed}
-        ids = [check_env(name) for name in args.env] or sorted(able, key=last.__contains__)
+        last = {env_id for env_id, problem in known.items() if problem and problem.relaxed}
+        ids = [check_env(name) for name in args.env] or sorted(TASKS, key=last.__contains__)
         for env_id in dict.fromkeys(ids):
             compute_optimum(env_id, args)
     except (UserError, CacheError, OSError) as error:
@@ -572,25 +572,20 @@ def _interrupt(number: int, frame: Any) -> None:
 
 
 def compute_optimum(env_id: str, args: argparse.Namespace) -> None:
-    """Compute, write and draw one environment's optimum; if it has no grid, plan instead."""
-    if TASKS[env_id].plans is not None:
+    """Compute, write and draw one environment's optimum; if it has no grid, plan instead.
+
+    Without a plan either, the best known policy is a controller or a learner's: its return is measured.
+    """
+    task = TASKS[env_id]()
+    if task.plans is not None or task.value_iteration is None:
         from agents import plans, scale  # they play what is found here
 
-        plans.find_plans(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)
-        if not args.quick:
-            scale.main(
-                [
-                    env_id,
-                    "--batches",
-                    "1",
-                    "--size",
-                    "8192",
-                    "--planned",
-                    str(plans.EPISODES),
-                    "--output",
-                    str(FILE),
-                ]
-            )
+        if task.plans is not None:
+            plans.find_plans(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)
+        if not args.quick or task.plans is None or task.plans.of:
+            size = ["--batches", "1", "--size", "512" if args.quick else "8192"]
+            more = ["--quick"] if args.quick else ["--planned", str(plans.EPISODES), "--output", str(FILE)]
+            scale.main([env_id, *size, *more])
         return
     results, images = (args.folder, args.folder) if args.quick else (RESULTS, IMAGES)
     result = compute(env_id, args.folder, quick=args.quick, new=args.new)

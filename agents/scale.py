@@ -6,7 +6,8 @@ beside the numbers in use. A slow policy plays only the first episodes, and its 
 reference's returns in these and in all episodes (a control variate). The reference's own number comes from
 other, independent episodes. ``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use
 stay, and an environment without any gets new ones. Its best known policy is then the best of its controllers
-and of the trained learners, each of which plays with the seed that ended best.
+and of the trained learners, each of which plays with the seed that ended best. Where that run is missing, the
+policy that ships with the package is played.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
+from lag_envs.leaderboard.shipped import load, shipped
 from lag_envs.options import module_parser, new_file
 from lag_envs.store import write_file
 from lag_envs.tasks import resolve
@@ -154,9 +156,13 @@ def measure_environment(
         tail = "" if used is None else f"   in use: {used}"
         print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}{tail}", flush=True)
 
+    best = shipped().get(env_id)  # played where runs are missing
     in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
     for name in dict.fromkeys(names):
-        if name not in {*known, *learners, "optimal"}:
+        if name not in {*known, *learners, "optimal"} and best and name == best.name:
+            returns = fast_returns(env_id, load(env_id), batches, size)
+            show(name, *mean_and_error(returns), len(returns), in_use.get(name))
+        elif name not in {*known, *learners, "optimal"}:
             print(f"{env_id:28} {name:20} is not in {runs}; what was measured of it before stays", flush=True)
             found[name] = kept["measured"][name]
         elif name not in slow:

@@ -19,6 +19,7 @@ from lag_envs.scores import known_returns
 from lag_envs.tasks.acrobot import AcrobotReal, PendubotReal
 from lag_envs.tasks.arm import Reach
 from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleSwingUp
+from lag_envs.tasks.chain import Balance
 from lag_envs.tasks.pendulum import PendulumExact, PendulumRegret
 from lag_envs.tasks.registration import make_task
 from lag_envs.tasks.rotary_pendulum import RotarySwingUp
@@ -84,7 +85,7 @@ def best(env_id):
     return known_returns(env_id).best
 
 
-@pytest.mark.parametrize("env_id", [CartPoleSwingUp.id, slow(CartPoleContinuous.id)])
+@pytest.mark.parametrize("env_id", [CartPoleSwingUp.id, slow(CartPoleContinuous.id), slow(Balance.id)])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_leaving_does_not_pay(env_id, side):
     assert play(env_id, Constant(side), range(20)).max() < 0.2 * best(env_id)
