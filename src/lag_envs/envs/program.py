@@ -400,7 +400,7 @@ class Program:
         # If the fast formula does not hold, or the last reward is special, the start is kept for another try.
         holds = "within and not over > 0.0" if self.last else "within"
         main = [
-            *inputs, *self._moved,
+            *inputs, *self._to_end,
             "again = n < 0.0", *self.outcome,
             f"plain = {holds}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
             "n = n + 1.0", *counted, "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
@@ -415,7 +415,7 @@ class Program:
             *ordinary,
             "if ordinary == 0.0:",
             *indent([
-                *inputs, *self._again,
+                *inputs, *self._to_end_again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
                 *indent([*self._store(["over", "r"], ["0.0", "0.0"]), *refused]),
@@ -516,14 +516,14 @@ class Program:
         ])  # fmt: skip
 
     @property
-    def _moved(self) -> list[str]:
+    def _to_end(self) -> list[str]:
         """The lines of the main loop to ``z`` and to the controls of the reward, and whether they hold."""
         if self.general:
-            return [*self._again, "within = status > 0.0"]
+            return [*self._to_end_again, "within = status > 0.0"]
         return [*self._load(self.a), *self._controls, *self.fast]
 
     @property
-    def _again(self) -> list[str]:
+    def _to_end_again(self) -> list[str]:
         """The same with the commands stored, for any step of a single lane."""
         if not self.general:
             return [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]

@@ -171,11 +171,11 @@ class DividedProgram(WholeProgram):
         return [*self._load(["moved"]), *indented("if moved == 1.0:", body)] if watch else []
 
     @property
-    def _moved(self) -> list[str]:
-        return [*self._again, "within = failed == 0.0"]
+    def _to_end(self) -> list[str]:
+        return [*self._to_end_again, "within = failed == 0.0"]
 
     @property
-    def _again(self) -> list[str]:
+    def _to_end_again(self) -> list[str]:
         return [
             *self._load([*self.z, "failed"]), *self._load(self._mean, self.u),
             *self._in_force, *self._load(self._now, self.in_force_after),
