@@ -85,7 +85,7 @@ UNTRACEABLE = {
     "number beyond floats": ({"potential": lambda self, q, xp: 10**400 * q.x}, "potential; the number inf"),
     "int of a number": ({"potential": lambda self, q, xp: int(q.x) * q.x}, "potential; int(); smooth"),
     "remainder": ({"potential": lambda self, q, xp: (q.x % 1.0) ** 2}, "potential; %; smooth"),
-    "floor division": ({"potential": lambda self, q, xp: (q.x // 1.0) ** 2}, "potential; %; smooth"),
+    "floor division": ({"potential": lambda self, q, xp: (q.x // 1.0) ** 2}, "potential; //; smooth"),
     "largest": ({"potential": lambda self, q, xp: max(q.x, 0.0) ** 2}, "potential; max; branch"),
     "less than": (
         {"potential": lambda self, q, xp: q.x**2 if q.x < 0.0 else 0.0},
@@ -222,7 +222,7 @@ INVALID = {
     "negative mass": ({"kinetic": lambda self, q, v, xp: v.x**2 / 2 - v.y**2 / 2}, "kinetic; not positive"),
     "velocity in the potential": (
         {"potential": lambda self, q, v, xp: q.x**2 + v.x},
-        "potential; (self, q, xp); (self, q, v, xp)",
+        "potential: it must be; (self, q, xp); (self, q, v, xp)",
     ),
     "explicit time": (
         {"potential": lambda self, q, t, xp: q.x**2 * xp.cos(t)},

@@ -167,7 +167,8 @@ def test_several_recordings_angles_within_one_turn_and_controls_of_both_lengths(
     wrapped = data.copy()
     wrapped[:, 0] = (data[:, 0] + np.pi) % (2.0 * np.pi) - np.pi
     assert np.abs(np.diff(wrapped[:, 0])).max() > 5.0
-    half = [(wrapped[:51], torques[:51], DT), (data[50:], torques[50:, None], DT)]
+    sampled = np.append(torques[:50], np.nan)  # the last one is not used
+    half = [(wrapped[:51], sampled, DT), (data[50:], torques[50:, None], DT)]
     found = Pendulum().fit(half, list(ROD))
     assert agrees(found, ROD)
     assert [len(x) for x in found.simulated] == [51, 51]
@@ -315,7 +316,7 @@ def test_hardly_determined():
 def test_at_rest():
     """Nothing moves, so nothing is learnt; sin(π) is rounding, and no signal."""
     still = np.tile([math.pi, 0.0], (100, 1))
-    with pytest.raises(ValueError, match="do not determine length"):
+    with pytest.raises(ValueError, match=r"do not determine length, .* measured\. Add recordings"):
         Pendulum(mass=0.3, length=0.8, damping=0.01).fit([(still, None, 0.02)], ["length"])
 
 
@@ -389,6 +390,8 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
         ([(STATES, None, DT)], {"noise": {"angle": 1.0}}, "noise: there is no state 'angle'"),
         ([(STATES, None, DT)], {"noise": {"theta": 1.0}}, "noise lacks theta_dot"),
         ([(STATES, None, DT)], {"noise": {"theta": 0.0}}, r"noise\['theta'\] must be above 0, got 0"),
+        ([(STATES, None, DT)], {"noise": 0.01}, "by its name, as in {'theta': 0.01}, got 0.01"),
+        ([(STATES * [np.nan, 1], None, DT)], {"noise": 0.0}, "by its name, as in {'theta_dot': 0.01}"),
         ([(STATES, None, DT)], {"level": 95}, "level must be between 0 and 1, got 95"),
     ],
 )
@@ -400,6 +403,10 @@ def test_bad_input(recordings, keywords, message):
 def test_a_first_guess_that_cannot_be_simulated():
     with pytest.raises(StepRefused, match="step 0"):
         Pendulum(gravity=1e50).fit([(STATES, None, DT)], ["length"])
+    with pytest.raises(
+        StepRefused, match=r"guess .*: a, not measured, was guessed to be 0 .*; measure it too"
+    ):
+        Bob().fit([(np.full((20, 4), [np.nan, np.nan, 0.0, 1.0]), None, DT)], ["drag"])
 
 
 # --- the tutorial ---

@@ -125,6 +125,11 @@ def test_another_file_replaces_what_was_registered(write):
     assert gym.make("Pump-v0").unwrapped.task.action == {"torque": 3.0}
 
 
+def test_an_alias_is_no_other_class(write):
+    path = write(SCENE + TASK + "\nfor T in [Pump]:\n    pass\nAlias = Swing\n")
+    assert own_files.one(path).__name__ == "Pump" and list(own_files.scenes(path)) == ["Swing"]
+
+
 def test_neighbours_can_be_imported(write):
     write(SCENE, "swings.py")
     path = write("from swings import Swing\n" + TASK)

@@ -4,6 +4,7 @@ import copy
 import pickle
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import cloudpickle
 import gymnasium as gym
@@ -16,7 +17,7 @@ from rollouts import RENDERS
 
 import lag_envs
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.scenes import StepRefused
+from lag_envs.scenes import Scene, StepRefused
 from lag_envs.tasks import Task, pivoted_bar
 
 IDS = [task.id for task in own_tasks.TASKS]
@@ -217,6 +218,12 @@ def _mistaken(**changes):
         ({"observe": lambda self, after, target, xp: [after.x]}, "observe must return numbers by name"),
         ({"observe": lambda self, after, target, xp: {"x": after.y}}, "there is no entry of the state 'y'"),
         ({"reward": lambda self, *_: None}, "reward returns None"),
+        (
+            {"reward": lambda self, after: 0.0},
+            r"reward must be reward\(self, before, .*, got \(self, after\)",
+        ),
+        ({"reward": 0.0}, r"Mistaken.reward must be reward\(self, before, .*, got 0.0"),
+        ({"reward": lambda self, b, after, *a: a[-1].clip(after.x, 0, 1)}, "it uses xp.clip; .* minimum"),
         ({"reward": lambda self, b, after, *_: 1.0 if after.x > 0 else 0.0}, "branch"),
         ({"terminated": lambda self, after, target, xp: after.x > 1 and after.x < 2}, "branch"),
         ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),
@@ -229,6 +236,7 @@ def _mistaken(**changes):
         ({"defaults": {"load_mas": 1.0}}, "Mistaken.defaults: .*'load_mas'; did you mean load_mass?"),
         ({"usable": {"load_mas": (0.0, 1.0)}}, "Mistaken.usable: .*'load_mas'; did you mean load_mass?"),
         ({"interval": "short"}, "Mistaken.interval must be a real number"),
+        ({"steps": 50.5}, "Mistaken.steps must be a whole number, or infinity for no end, got 50.5"),
         ({"draws": 1.5}, "Mistaken.draws must be a whole number, 0 or more, got 1.5"),
         ({"kick": Task.kick}, "Mistaken.draws is 2, but there is no kick"),
         ({"kick": lambda self, after, draws, xp: None}, "kick returns None; it must return changes"),
@@ -255,6 +263,39 @@ def _mistaken(**changes):
 def test_mistakes_in_a_task(changes, message):
     with pytest.raises((FormulaError, ValueError), match=message):
         _mistaken(**changes)().formulas.box()
+
+
+def test_velocities_of_a_task_are_in_the_order_of_energies():
+    class Belt(Scene):
+        coordinates = {"x": "m"}
+        prescribed = {"s": "m"}
+        controls = {"s_ddot": "m/s²"}
+
+        def kinetic(self, q, v, xp):
+            x_dot, s_dot = v
+            return x_dot**2 + 3.0 * s_dot**2
+
+        def potential(self, q, xp):
+            return q.x**2
+
+    class Ride(Task):
+        scene = Belt
+        action = {"s_ddot": 1.0}
+
+        def observe(self, after, target, xp):
+            return {"energy": self.scene.kinetic(after, after.v, xp)}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return after.x
+
+    task, state = Ride(), [0.1, 2.0, 0.3, 5.0]
+    seen = task.formulas.observe(np, state, [], SimpleNamespace(**task.formulas.constants()))
+    assert seen == [task.scene.energy(state)["kinetic"]] == [5.0**2 + 3.0 * 2.0**2]
+
+
+def test_a_task_without_a_scene():
+    with pytest.raises(FormulaError, match=r"Sceneless\.scene must be a class derived from Scene, got None"):
+        type("Sceneless", (Task,), {"action": {"push": 1.0}})()
 
 
 def test_a_kick_states_how_many_numbers_it_draws():

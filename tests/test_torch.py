@@ -1,5 +1,8 @@
 """Environments on tensors: equal to the environments, and with gradients."""
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -35,6 +38,7 @@ def test_gradcheck(env_id, step):
     assert torch.autograd.gradcheck(lambda *given: step(*given)[:3], tuple(near(2)), rtol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, for jacfwd
 def test_torch_func(step):
     states, actions = near(3)
     whole = torch.func.vmap(torch.func.jacrev(lambda s, a: step(s, a).states, argnums=(0, 1)))
@@ -52,6 +56,23 @@ def test_torch_func(step):
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         (once,) = torch.autograd.grad(step(states, actions).rewards.sum(), states, create_graph=True)
         once.sum().backward()
+    for forward in (torch.func.jacfwd, torch.func.hessian):
+        with pytest.raises(NotImplementedError, match="no forward mode and no second derivatives"):
+            forward(lambda s: step(s, actions[0]).rewards)(states[0])
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies(step, copied):
+    """Of what has derivatives compiled, and of states with a history."""
+    states, actions = near(2)
+    slopes = [torch.autograd.grad(s(states, actions).rewards.sum(), states)[0] for s in (step, copied(step))]
+    assert torch.equal(*slopes)
+    envs = TorchVectorEnv(IDS[0], 2)
+    envs.reset(seed=0)
+    envs.step(actions)
+    again = copied(envs)
+    assert envs.state.requires_grad and not again.state.requires_grad
+    assert torch.equal(envs.step(actions)[0], again.step(actions)[0])
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -127,11 +127,12 @@ def scenes(path: str) -> dict[str, type[Any]]:
 
 
 def _classes(module: ModuleType) -> dict[str, type]:
-    return {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type) and value.__module__ == module.__name__
-    }
+    """Return the classes of a module by their first names: an alias is no other class."""
+    names: dict[type, str] = {}
+    for name, value in vars(module).items():
+        if isinstance(value, type) and value.__module__ == module.__name__:
+            names.setdefault(value, name)
+    return {name: kind for kind, name in names.items()}
 
 
 def chosen_tasks(name: str) -> dict[str, type[Any]]:

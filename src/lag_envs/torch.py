@@ -16,7 +16,7 @@ torch.Size([2, 1])
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -66,7 +66,7 @@ class Step:
     """A task's step as a differentiable function: any states, any actions, no random kick, no time limit.
 
     It can be used with `torch.autograd`, and with `vmap`, `grad`, `vjp` and `jacrev` of `torch.func`. There
-    are no second derivatives.
+    is no forward mode (`jvp`, `jacfwd`), and there are no second derivatives (`hessian`).
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class TorchVectorEnv:
     On the CPU the numbers are those of the native vector environment, bit for bit, and tensors share its
     memory. If the actions, or the states that earlier actions led to, require a gradient, `step` is
     recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
-    until `detach` cuts them off. No gradient flows across an episode's end.
+    until `detach` cuts them off. No gradient flows across an episode's end. Copies have no history.
 
     On an NVIDIA GPU one kernel takes the whole step, states stay on the GPU, and there are no gradients. In
     float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
@@ -211,6 +211,10 @@ class TorchVectorEnv:
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
         self._take_spaces(made)
         self.observation_space, self.action_space = made.observation_space, made.action_space
+
+    def __getstate__(self) -> dict[str, Any]:
+        history = self.state.requires_grad
+        return vars(self) | ({"state": self.state.detach()} if history else {})
 
     def _take_spaces(self, made: LagrangianVectorEnv) -> None:
         self.single_observation_space = made.single_observation_space
@@ -340,6 +344,13 @@ class _RowStep(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *seeds: Tensor) -> tuple:
         return None, *_RowStepBackward.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> NoReturn:
+        raise NotImplementedError(
+            "a step has no forward mode and no second derivatives: use jacrev in place of jacfwd, and leave "
+            "out jvp and hessian"
+        )
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:

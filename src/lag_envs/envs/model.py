@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,6 +92,9 @@ class Model:
         self._step = program.model
         self._n_state = program.n_state
         self._reversed: dict[tuple[str, ...], Reverse] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_reversed": {}}  # compiled, and made again on use
 
     def __call__(
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None

@@ -296,7 +296,7 @@ class Expr:
         self._refuse("abs()", "an energy must be smooth: xp.sqrt(x * x + eps * eps) rounds the corner")
 
     def __mod__(self, other: Any) -> Expr:
-        self._refuse("%", "a formula must be smooth")
+        self._refuse("%, // or divmod()", "a formula must be smooth")
 
     __rmod__ = __floordiv__ = __rfloordiv__ = __divmod__ = __rdivmod__ = __mod__
 

@@ -180,11 +180,10 @@ def formula(scene: Any, name: str) -> Iterator[None]:
 
 def check_signature(scene: Any, name: str) -> None:
     """Raise a FormulaError if a formula does not take the expected arguments."""
-    of = type(scene).__name__
     method, arguments = getattr(scene, name, None), ARGUMENTS[name]
     wanted = f"{name}(self, {', '.join(arguments)})"
     if not callable(method):
-        raise FormulaError(f"{of}.{name} must be a method, {wanted}, got {method!r:.60}")
+        raise FormulaError(f"it must be a method, {wanted}, got {method!r:.60}")
     kinds = inspect.Parameter
     taken = list(inspect.signature(method).parameters.values())
     if any(p.kind is kinds.VAR_POSITIONAL for p in taken):
@@ -197,7 +196,7 @@ def check_signature(scene: Any, name: str) -> None:
             else ""
         )
         raise FormulaError(
-            f"{of}.{name} must be {wanted}, got ({', '.join(['self', *(p.name for p in taken)])}){time}"
+            f"it must be {wanted}, got ({', '.join(['self', *(p.name for p in taken)])}){time}"
         )
 
 

@@ -88,6 +88,9 @@ class Scene(metaclass=SceneType):
             def applied(self, q, v, u, xp):
                 return {"theta": u.torque}
 
+    ``q``, ``v`` and ``u`` go by name, by index and in order. The order of ``q`` and ``v`` is not the state's:
+    the free coordinates come first, then the prescribed ones, each as declared.
+
     Formulas use ``+ - * /``, whole powers and functions of ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log.
     They are run on recorded numbers, so they cannot branch on them. Fields that are not a `parameter`, such
     as a number of bars, are structural: formulas may branch on them, and a new value needs a new compilation.
@@ -575,7 +578,8 @@ class Scene(metaclass=SceneType):
             The parameters to find. The search begins with the scene's values. Others are held, except
             parameters that have the default value computed from others: they keep following those.
         noise : mapping from str to float, optional
-            Standard deviation of the measurements of each state. By default it is estimated for each state.
+            Standard deviation of the measurements of each state, as in ``{"theta": 0.01}``. By default it is
+            estimated for each state.
         level : float, default 0.95
             Level of the confidence intervals.
 
@@ -597,7 +601,8 @@ class Scene(metaclass=SceneType):
             For data that do not determine the parameters, naming these; for a parameter that the scene lacks;
             for recordings of a wrong shape, with too few values, or with controls that are not finite.
         StepRefused
-            If the motion cannot be simulated with the initial parameters.
+            If the motion cannot be simulated with the initial parameters. A coordinate that was not measured
+            is first guessed to be 0, and is named if it is.
         """
         from lag_envs.scenes.fitting.fit import fit
 

@@ -34,6 +34,7 @@ from lag_envs.scenes.derivation import (
     series_order_of,
     step_argument_of,
 )
+from lag_envs.stepping.elementary import LARGEST_ANGLE
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
 if TYPE_CHECKING:
@@ -292,14 +293,26 @@ def refusal(
 ) -> StepRefused:
     """Return the error for a refused step."""
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
-    held = zip(scene.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
+    values = np.atleast_1d(np.asarray(control, dtype=np.float64))
+    held = zip(scene.control_names, values, strict=True)
     why = "it could not be certified within the largest number of substeps"
+    remedy = "take a smaller dt or milder parameters"
     if form_of(scene) is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
+    elif far := _far_angles(scene, state, values):
+        why = f"it needs sine and cosine of {far}, which are not computed beyond {LARGEST_ANGLE:g} rad"
+        remedy = f"subtract whole turns from {far}"
     error = StepRefused(
         f"{where} was refused: from ({start}) with "
         f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}, or has no "
-        "finite result; take a smaller dt or milder parameters"
+        f"finite result; {remedy}"
     )
     error.trajectory = None if trajectory is None else trajectory.copy()
     return error
+
+
+def _far_angles(scene: Scene, state: Array, control: Array) -> str:
+    """Return the names of angles too large for the general series."""
+    names, units = scene.state_names + scene.control_names, scene.state_units + scene.control_units
+    given = zip(names, units, (*state, *control), strict=True)
+    return " and ".join(n for n, unit, value in given if unit == "rad" and abs(value) > LARGEST_ANGLE)

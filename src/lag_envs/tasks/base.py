@@ -125,7 +125,7 @@ class Task:
     """
 
     id: ClassVar[str] = ""
-    scene: Any
+    scene: Any = None
     defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     interval: ClassVar[float] = 0.02
     steps: ClassVar[int] = 500
@@ -204,9 +204,10 @@ class Task:
         self.dt = interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
-        seconds = (
-            interval * check_number(f"{of}.steps", self.steps, endless=True) if duration is None else duration
-        )
+        steps = check_number(f"{of}.steps", self.steps, endless=True)
+        if steps != math.inf and steps % 1.0:
+            raise ValueError(f"{of}.steps must be a whole number, or infinity for no end, got {steps:g}")
+        seconds = interval * steps if duration is None else duration
         self.duration = check_number("duration", seconds, "s", endless=True)
         if not self.duration >= self.dt:
             raise ValueError(f"duration must be at least dt={self.dt:g} s, got {self.duration:g} s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import hashlib
+import inspect
 import itertools
 import math
 import numbers
@@ -247,7 +248,8 @@ class TaskFormulas:
         """Return the entries of a state by name, and the velocities by coordinate."""
         layout = layout_of(self._task.scene)
         names = dict(zip(self.state, y, strict=False))
-        rates = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
+        found = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
+        rates = {name: found[name] for name in layout.names if name in found}  # in the order of energies
         hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates)}
         return Values("entry of the state", names, hidden)
 
@@ -260,7 +262,15 @@ class TaskFormulas:
 
     def _call(self, name: str, k: Any, *arguments: Any) -> Any:
         with formula(self._task, name):
-            return getattr(self.with_numbers(k), name)(*arguments)
+            try:
+                return getattr(self.with_numbers(k), name)(*arguments)
+            except AttributeError as error:
+                if not isinstance(error.obj, ElementaryTrace):
+                    raise
+                raise FormulaError(
+                    f"it uses xp.{error.name}; a task's formula has xp.sin, cos, tan, atan, tanh, sqrt, exp, "
+                    "log, where, abs, minimum, maximum, floor and pi"
+                ) from error
 
     def action(self, control: Any) -> Any:
         """Return the unclipped action that requests a control; for tasks with one control."""
@@ -361,6 +371,7 @@ class TaskFormulas:
 
     def _recorded(self) -> tuple[tuple[str, ...], str]:
         """Run all formulas, for their errors; return the observation's names and a digest of the code."""
+        _check_arguments(self._task, self._base)
         trace = self.trace(numeric=True)
 
         class Inputs:
@@ -472,6 +483,24 @@ def _check_definition(task: Task, base: type[Task]) -> None:
     if kind.kick is base.kick and task.draws:
         raise FormulaError(f"{kind.__name__}.draws is {task.draws}, but there is no kick that takes them")
     warn_of_misspelt(kind, base)
+
+
+def _check_arguments(task: Task, base: type[Task]) -> None:
+    """Raise a FormulaError if a formula does not take what it is given."""
+    for name in FORMULAS:
+        method, wanted = getattr(task, name), list(inspect.signature(getattr(base, name)).parameters)
+        if not callable(method):
+            raise FormulaError(
+                f"{type(task).__name__}.{name} must be {name}({', '.join(wanted)}), got {method!r:.60}"
+            )
+        taken = inspect.signature(method)
+        try:
+            taken.bind(*wanted[1:])
+        except TypeError:
+            raise FormulaError(
+                f"{type(task).__name__}.{name} must be {name}({', '.join(wanted)}), "
+                f"got ({', '.join(['self', *taken.parameters])})"
+            ) from None
 
 
 def control_of(acting: Acting, a: Any, xp: Any) -> Any:

@@ -91,8 +91,10 @@ class Determined:
         if texts:
             names = zip(self._parameters.names, values, strict=True)
             ended = ", ".join(f"{name}={value:.3g}" for name, value in names)
+            several = len(self._parameters.names) > 1
+            remedy = "Leave one out of free, so that it is held, or add" if several else "Add"
             raise ValueError(
-                f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is "
-                "held, or add recordings in which it has an effect, such as some under known controls. The "
-                f"search ended at {ended}; if that is far off, begin closer to the truth"
+                f"the data do not determine {'; nor '.join(texts)}. {remedy} recordings in which it has an "
+                f"effect, such as some under known controls. The search ended at {ended}; if that is far "
+                "off, begin closer to the truth"
             )

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.errors import hint
-from lag_envs.scenes.checks import check_number, check_parameters, shown
+from lag_envs.scenes.checks import StepRefused, check_number, check_parameters, shown
+from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.fitting.determined import Determined
 from lag_envs.scenes.fitting.parameters import FreeParameters
 from lag_envs.scenes.fitting.recordings import Recording, guess, recordings_of
@@ -108,6 +109,12 @@ class _Sizes:
         self.range = np.ptp(values, axis=0)
         self.range[self.range <= np.maximum(LEAST_RANGE, LEAST_NOISE * np.abs(values).max(axis=0))] = 1.0
         self.noise, self.given = self.range.copy(), noise is not None
+        if self.given and not isinstance(noise, Mapping):
+            first = scene.state_names[int(np.argmax(self.seen))]
+            raise ValueError(
+                f"noise must give the standard deviation of each measured state by its name, as in "
+                f"{{{first!r}: 0.01}}, got {shown(noise)}"
+            )
         for name, value in (noise or {}).items():
             if name not in scene.state_names:
                 raise ValueError(
@@ -158,13 +165,34 @@ def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) 
         starts = [sizes.guesses[piece.recording][piece.first] for piece in pieces]
         shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
         z = np.concatenate([z[:p], *starts])
-        shooting.simulate(z)  # if this is refused, its error says why
+        try:
+            shooting.simulate(z)
+        except StepRefused as error:
+            raise _explained(error, parameters.scene(z[:p]), data, sizes) from error
         z[:p] = shooting.solve(z, COARSE, starts=False).x
         sizes.estimate(shooting, z)
     shooting = shooting.weighed(sizes.noise, sizes.gap)
     z = shooting.solve(z, COARSE).x
     sizes.estimate(shooting, z, len(z) / shooting.count)
     return shooting, z
+
+
+def _explained(error: StepRefused, scene: Scene, data: list[Recording], sizes: _Sizes) -> StepRefused:
+    """Return the error of a first simulation, with the coordinates that were guessed to be 0."""
+    guessed = [
+        entry.name
+        for i, entry in enumerate(layout_of(scene).state)
+        if entry.kind == "place"
+        and any(
+            not r.measured[:, i].any() and x[0, i] == 0.0 for r, x in zip(data, sizes.guesses, strict=True)
+        )
+    ]
+    if not guessed:
+        return error
+    return StepRefused(
+        f"the first guess cannot be simulated: {' and '.join(guessed)}, not measured, was guessed to be 0 at "
+        f"the start; measure it too ({error})"
+    )
 
 
 def _result(

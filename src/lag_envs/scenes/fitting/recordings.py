@@ -93,15 +93,16 @@ def _controls(scene: Scene, controls: Any, count: int) -> Array:
     steps, n = count - 1, len(scene.control_names)
     if controls is None:
         return np.zeros((steps, n))
+    if n:  # what was sampled together with the last state acts only after it, and need not be finite
+        array = real_array("controls", controls)
+        controls = array[:steps] if array.shape[:1] == (count,) else array
     given = check_sequence(scene, controls)
-    if len(given) == count:  # sampled together with the states: the last one acts only after the last state
-        given = given[:steps]
-    if len(given) != steps:
+    if len(given) not in ((steps,) if n else (steps, count)):
         raise ValueError(
             f"{count} states need controls for the {steps} steps between them, or one for each state, of "
             f"which the last is not used; got {len(given)}"
         )
-    return given
+    return given[:steps]
 
 
 def _unwrapped(scene: Scene, states: Array) -> Array:
