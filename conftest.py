@@ -8,6 +8,8 @@ import gymnasium as gym
 import pytest
 from browsers import browser, browsing  # noqa: F401 (fixtures)
 
+import lag_envs  # noqa: F401 (registers its environments before any test)
+
 # Numba makes many objects and hardly any cycles: searching for these takes a tenth of its time.
 gc.freeze()
 gc.set_threshold(100_000, 50, 50)
