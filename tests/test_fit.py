@@ -142,7 +142,7 @@ def test_an_angle_of_which_only_the_rate_is_measured_on_a_cart():
     assert agrees(found, CART)
 
 
-@pytest.mark.parametrize("seed", [3, slow(0), slow(5), slow(13)])
+@pytest.mark.parametrize("seed", [slow(0), slow(3), slow(5), slow(13)])
 def test_gyroscopes_on_two_bars(seed):
     truth = {"length": 0.6, "damping": 0.002}
     start = np.random.default_rng(seed).uniform(-3.0, 3.0, 6)

@@ -353,6 +353,7 @@ def test_command_writes_numbers_and_a_figure(tmp_path, capsys, monkeypatch):
     assert "use --new" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_grid_and_plans_the_best_known_policy_is_measured(capsys):
     """Its run is not kept: the policy that ships with the package is played."""
     assert optimum.main([Reach.id, "--quick"]) == 0
