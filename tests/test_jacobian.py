@@ -92,7 +92,7 @@ def oracle(case):
     ("kind", "n"),
     [
         slow("damped", 3),
-        ("stiff", 4),
+        slow("stiff", 4),
         slow("task", 3),
         *(slow(kind, 40) for kind in ("damped", "stiff")),
     ],

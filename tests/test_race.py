@@ -71,6 +71,7 @@ def test_a_training_that_fails_costs_only_itself(command, tmp_path):
     assert status == 1 and "level" not in output and not (tmp_path / "race.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_a_process_that_dies_leaves_nothing_behind(monkeypatch):
     monkeypatch.setattr(race, "train_seed", dies)

@@ -320,8 +320,8 @@ class AcrobotReal(Task):
     note = (
         "The LQR is that of the project's leaderboard. It only holds links that are upright already; it "
         "does not swing up hanging ones. The plan was found on the exact model with friction; its feedback "
-        "comes from a model without dry friction. Learners stay below the plan, with large differences "
-        "between seeds. TD3, SAC and TQC hold their noise for many steps; the PPO in one file takes many "
+        "comes from a model without dry friction. Learners stay below the plan on average, and their seeds "
+        "differ much. TD3, SAC and TQC hold their noise for many steps. The PPO in one file takes many "
         "more steps, and less time."
     )
 
@@ -384,7 +384,7 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (AcrobotReal's docstring, adapted
         **AcrobotReal.hyperparameters,
         "fast_ppo": {
             "n_timesteps": 5e6, "n_steps": 128, "batch_size": 2048, "gamma": 0.998, "gae_lambda": 0.95,
-            "reward_scale": 1.0, "noise_steps": 4, "max_grad_norm": 0.5,
+            "reward_scale": 1.0, "max_grad_norm": 0.5,
         },
     }  # fmt: skip
     plans = dataclasses.replace(AcrobotReal.plans, steps=85)
