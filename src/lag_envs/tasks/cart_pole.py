@@ -245,8 +245,8 @@ class CartPoleContinuous(_OnTrack):
     draws = 2
 
     goal = Goal(
-        "success: not fallen, and on the track", hold=None, terminated=None,
-        counted=False,  # protocol 2 began without `terminated`, and so without any success
+        "success: not fallen, and on the track", hold=None,
+        counted=False,  # protocol 2 began with `terminated=False`; the next one has to begin with None
     )  # fmt: skip
     controllers = {
         "LQR": Controller(

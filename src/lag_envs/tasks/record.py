@@ -32,8 +32,8 @@ class Goal:
         Version of the board's rules: 2 adds to its disturbances imperfect sensors and actuators, and hidden
         parameters. A board keeps the version that it began with.
     counted : bool
-        Whether the board shows how many episodes succeed. Not if its protocol began with another rule:
-        stored results are never changed.
+        Whether the board shows how many episodes succeed. Not if its protocol began with a rule that cannot
+        hold: it stays as it is until the next one.
     """
 
     text: str
