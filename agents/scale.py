@@ -159,10 +159,11 @@ def measure_environment(
     best = shipped().get(env_id)  # played where runs are missing
     in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
     for name in dict.fromkeys(names):
-        if name not in {*known, *learners, "optimal"} and best and name == best.name:
-            returns = fast_returns(env_id, load(env_id), batches, size)
-            show(name, *mean_and_error(returns), len(returns), in_use.get(name))
-        elif name not in {*known, *learners, "optimal"}:
+        if name not in {*known, *learners, "optimal"}:
+            if best and name == best.name:
+                returns = fast_returns(env_id, load(env_id), batches, size)
+                show(name, *mean_and_error(returns), len(returns), in_use.get(name))
+                continue
             print(f"{env_id:28} {name:20} is not in {runs}; what was measured of it before stays", flush=True)
             found[name] = kept["measured"][name]
         elif name not in slow:

@@ -254,11 +254,6 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
     return scale, -0.5 * scale * (high + low)
 
 
-def idle_actions(formulas: TaskFormulas) -> Array:
-    """Return the numbers of the actions that request no control."""
-    return np.zeros(formulas.actions) if formulas.choices else per_control(formulas)[1] + 0.0
-
-
 def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:
     """Raise a ValueError for a name that is not among the known ones."""
     for name in given:

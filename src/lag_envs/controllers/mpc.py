@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions, idle_actions
+from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
 from lag_envs.controllers.ilqr import ILQR, SHARES
 from lag_envs.controllers.tracking import waves
 from lag_envs.envs.model import Model
@@ -95,11 +95,12 @@ class MPC:
         self.task, self.horizon, self.every = task, horizon, min(every, horizon)
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
-        self.largest, self.idle = task.formulas.largest, idle_actions(task.formulas)[0]
+        self.largest = task.formulas.largest
         self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
         calm = without_kicks(task)
         self.model = Model(calm)
         self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations)
+        self.idle = task.rest_action + 0.0  # no -0.0
         self.polisher = ILQR(calm, [], tail=tail, steps=horizon, iterations=5 * iterations)
         searched, end = easier or (calm, tail)
         rounds = max(budget // (guesses * horizon * len(SHARES)), 1)

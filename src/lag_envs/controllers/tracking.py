@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import FeedbackLaw, idle_actions, remade
+from lag_envs.controllers.basic import FeedbackLaw, remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -63,8 +63,7 @@ class Tracking(Clocked):
         self.states, self.actions, self.gains, self.rest, self.hold = (
             np.asarray(values, np.float64) for values in (states, actions, gains, rest, hold)
         )
-        # Shaped as one step's actions.
-        self.idle = idle_actions(task.formulas).reshape(self.actions.shape[1:])
+        self.idle = np.reshape(task.rest_action, self.actions.shape[1:]) + 0.0  # + 0.0: no -0.0
         steps = len(self.actions)
         for name, shape in self.shapes(task).items():
             wanted = tuple({"steps": steps, "steps + 1": steps + 1}.get(n, n) for n in shape)
