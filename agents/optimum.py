@@ -182,7 +182,8 @@ class Solution:
             "schema": CACHED, "env": self.env_id, "options": dict(problem.options), "target": target,
             "level": self.level, "pushes": problem.pushes, "constants": self.task.formulas.constants(),
         }  # fmt: skip
-        actions = np.linspace(-1.0, 1.0, problem.actions)
+        largest = self.task.formulas.largest
+        actions = np.linspace(-largest, largest, problem.actions)
         step = functools.partial(self.step, target=target)
         places = grid(problem, self.level, target)
         return DynamicProgramme(places, actions, step, self.steps, self.kick, parameters)
@@ -331,7 +332,8 @@ def proved_bound(env_id: str) -> tuple[float, str]:
     """Return an upper bound on any policy's mean return over the starts, and its reason."""
     task: Task = TASKS[env_id]()
     if task.optimum is None:
-        return task.limit, "steps of an episode; no step pays more than 1"
+        most = solvable()[env_id].most
+        return most * task.limit, f"steps of an episode; no step pays more than {most:g}"
     states, _ = starts(env_id)
     place, text = task.optimum.place, task.optimum.text
     return float(resolve(place)(task, *states.T).mean()), f"{text} (`{place.replace(':', '.')}`)"

@@ -103,6 +103,7 @@ class AcrobotExact(Task):
     start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.1)
     fastest_seen = {"theta_1_dot": 4.0 * math.pi, "theta_2_dot": 9.0 * math.pi}  # [rad/s]
 
+    goal = Goal("success: the tip passes the line; time: until then", hold=None, terminated=True)
     controllers = {
         "switch": Controller(
             "lag_envs.controllers.basic:Switch",
@@ -147,9 +148,13 @@ class AcrobotExact(Task):
         """Return 0."""
         return 0.0
 
-    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
         """Return whether the tip is a link's length above the pivot."""
         return -xp.cos(after.theta_1) - xp.cos(after.theta_1 + after.theta_2) > 1.0
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Return the same: the episode ends there."""
+        return self.reached(after, target, xp)
 
     def bodies(self) -> Bodies:
         """Add the line that the tip is to pass."""

@@ -133,6 +133,7 @@ class CartPoleExact(_OnTrack):
     start = dict.fromkeys(_STATE, 0.05)
     unbounded = math.inf
 
+    goal = Goal("success: not fallen, and on the track", hold=None, terminated=None)
     controllers = {
         "LQR": Controller(
             "lag_envs.controllers.linear:Regulator",

@@ -12,7 +12,7 @@ from lag_envs.scenes.shapes import Bodies, outlines
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import FASTEST_START, Task
-from lag_envs.tasks.record import Controller, Examples, Goal, Optimum
+from lag_envs.tasks.record import Axis, Controller, Examples, Goal, Optimum, ValueIteration
 
 
 def wrapped(cosine: Any, sine: Any, xp: Any) -> Any:
@@ -34,6 +34,14 @@ class _Rod(Task):
         "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
         "sin(theta)": ("1", "its sine"),
     }
+    goal = Goal(
+        "success: within 0.1 rad of upright throughout the last second; time: until it is so for good",
+        arrival="upright",
+    )
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Return whether the rod is within 0.1 rad of upright."""
+        return xp.cos(after.theta) >= math.cos(0.1)
 
     def bodies(self) -> Bodies:
         """Add the upright rod."""
@@ -122,6 +130,14 @@ class PendulumExact(_Rod):
         "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
+    value_iteration = ValueIteration(
+        (
+            Axis("θ [rad]", 0.0, 2.0 * math.pi, 80, periodic=True, level=4),
+            Axis("θ' [rad/s]", -12.0, 12.0, 80, level=4),
+        ),
+        mirror="theta",
+        most=0.0,
+    )
     hyperparameters = {
         "ppo": {"gamma": 0.95},
         "fast_ppo": {"gamma": 0.95, "episode_share": 1.0},
@@ -235,10 +251,6 @@ class PendulumRegret(_Rod):
     start = {"theta": (math.pi, 0.2), "theta_dot": 0.2}
     penalty = 0.2
 
-    goal = Goal(
-        "success: within 0.1 rad of upright throughout the last second; time: until it is so for good",
-        arrival="upright",
-    )
     optimum = Optimum(
         "lag_envs.controllers.pendulum:value_at_start",
         "pump the energy up, then act as a damped spring; V(start), which nobody exceeds",
@@ -304,7 +316,3 @@ class PendulumRegret(_Rod):
         """Return V(before) - V(after) - 0.2 ((u - π(before))/U)²."""
         off = (control.torque - self.law(before, xp)) * (1.0 / self.action["torque"])
         return self.value(before, xp) - self.value(after, xp) - self.penalty * off * off
-
-    def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Return whether the rod is within 0.1 rad of upright."""
-        return xp.cos(after.theta) >= math.cos(0.1)

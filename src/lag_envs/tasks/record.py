@@ -201,7 +201,9 @@ class ValueIteration:
     pushes : int
         Number of kick sizes in the expectation: midpoints of as many parts of its random number.
     actions : int
-        Number of actions, evenly spaced from -1 to 1.
+        Number of actions, evenly spaced between the extremes.
+    most : float
+        Largest reward of a step.
     levels : tuple of float
         Fineness of the grids, each twice as fine as the one before.
     lost : float
@@ -219,6 +221,7 @@ class ValueIteration:
     targets: tuple[float, ...] = ()
     pushes: int = 0
     actions: int = 11
+    most: float = 1.0
     levels: tuple[float, ...] = (2, 4, 8)
     lost: float = 0.0
     mirror: str = ""
