@@ -13,13 +13,15 @@ from rollouts import actions, make
 from lag_envs.controllers import ILQR, build, make_controller
 from lag_envs.controllers.basic import Constant
 from lag_envs.controllers.lookahead import LookAhead
+from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scores import known_returns
+from lag_envs.tasks import TASKS
 from lag_envs.tasks.acrobot import AcrobotReal, PendubotReal
 from lag_envs.tasks.arm import Reach
 from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleSwingUp
-from lag_envs.tasks.chain import Balance
+from lag_envs.tasks.chain import Balance, SwingUp
 from lag_envs.tasks.pendulum import PendulumExact, PendulumRegret
 from lag_envs.tasks.registration import make_task
 from lag_envs.tasks.rotary_pendulum import RotarySwingUp
@@ -110,6 +112,28 @@ def test_spinning_does_not_pay(env_id, state, share):
         _, reward, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
         total, over = total + reward, terminated or truncated
     assert total * env.task.interval * env.task.steps / 2.0 < share * best(env_id)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "state"),
+    [
+        (Reach.id, [-0.5 * math.pi, 0.0, 0.0, 0.0]),
+        (Reach.id, [0.3, 0.0, math.pi, 0.0]),
+        (AcrobotReal.id, [math.pi, 0.0, 0.0, 0.0]),
+        (AcrobotReal.id, [0.0, 0.0, math.pi, 0.0]),
+        (RotarySwingUp.id, [0.0, 0.0, 0.0, 0.0]),
+        (SwingUp.id, [0.0, 0.0, 0.0, 0.0, math.pi, 0.0]),
+    ],
+)
+def test_singular_starts_are_no_exception(env_id, state):
+    """Links exactly in line, stretched or folded, and equilibria are stepped and paid like their neighbours."""
+    task, aim = TASKS[env_id](), [0.35, 0.1] if env_id == Reach.id else None
+    near = np.array([state, np.array(state) + 1e-9, np.array(state) - 1e-9])
+    actions = np.full((3, task.formulas.actions), 0.5)
+    ends, rewards, ended = Model(task)(near, actions if task.formulas.actions > 1 else actions[:, 0], aim)
+    assert np.isfinite(ends).all() and not ended.any()
+    assert np.abs(ends - ends[0]).max() < 1e-7 and np.abs(rewards - rewards[0]).max() < 1e-7
+    assert np.abs(task.scene.jacobian(near[0], task.wanted(actions)[0], task.dt)[0]).max() < 10.0
 
 
 def test_easy_entries_are_no_gift():
