@@ -126,7 +126,7 @@ def test_spinning_does_not_pay(env_id, state, share):
     ],
 )
 def test_singular_starts_are_no_exception(env_id, state):
-    """Links exactly in line, stretched or folded, and equilibria are stepped and paid like their neighbours."""
+    """Links exactly in line, stretched or folded, and equilibria are stepped like their neighbours."""
     task, aim = TASKS[env_id](), [0.35, 0.1] if env_id == Reach.id else None
     near = np.array([state, np.array(state) + 1e-9, np.array(state) - 1e-9])
     actions = np.full((3, task.formulas.actions), 0.5)

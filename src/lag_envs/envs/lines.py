@@ -9,6 +9,9 @@ from lag_envs.stepping.compiling import compile_function
 from lag_envs.stepping.flows import section
 from lag_envs.stepping.tracing import Trace
 
+#: The loop over the lanes of a block, which go on side by side.
+EACH_LANE = "for i in range(size):"
+
 
 def recorded_lines(
     formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], trace: type[Trace]

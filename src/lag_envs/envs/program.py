@@ -24,7 +24,15 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs import sharing
-from lag_envs.envs.lines import compiled_lines, draw_lines, indent, indented, next_episode, recorded_lines
+from lag_envs.envs.lines import (
+    EACH_LANE,
+    compiled_lines,
+    draw_lines,
+    indent,
+    indented,
+    next_episode,
+    recorded_lines,
+)
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.rows import Rows
@@ -391,7 +399,7 @@ class Program:
     def step_blocks(self) -> Callable:
         """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
         y, inputs = self.y, self._inputs
-        lane, ordinary = "for i in range(size):", self._load(["ordinary"])
+        ordinary = self._load(["ordinary"])
         results = ["n", "over", "r", *self.o, *(["clock"] if self.sensing else [])]
         counted = ["clock = n"] if self.sensing else []
         key = [self._key] if self.kick else []
@@ -454,14 +462,14 @@ class Program:
                 *(
                     line
                     for j, a in enumerate(self.a)
-                    for line in indented(lane, self._store([a], [f"action[{self._action(j)}]"]))
+                    for line in indented(EACH_LANE, self._store([a], [f"action[{self._action(j)}]"]))
                 ),
                 *self._command_lanes, *self._move_lanes,
-                *indented(lane, main),
-                *indented(lane, [*ordinary, "special += ordinary != 1.0"]),
-                "if special > 0:", *indent(indented(lane, special)),
+                *indented(EACH_LANE, main),
+                *indented(EACH_LANE, [*ordinary, "special += ordinary != 1.0"]),
+                "if special > 0:", *indent(indented(EACH_LANE, special)),
                 *self._sense_lanes,
-                *indented(lane, output),
+                *indented(EACH_LANE, output),
                 *self._show_block,
             ]),
         ]  # fmt: skip
@@ -495,7 +503,7 @@ class Program:
         given = self._stepper.given
         store = [*self._stepper.prepare, *self._store([self._flow[name] for name in given], given)]
         call = f"advance_block(par, np.int64({len(self.uniform)}), size, np.int64({self._x}))"
-        return [*indented("for i in range(size):", [*before, *store]), call]
+        return [*indented(EACH_LANE, [*before, *store]), call]
 
     @property
     def _advanced(self) -> list[str]:
@@ -604,7 +612,7 @@ class Program:
             *self._parameters(),
             "second, last = np.uint64(count), np.uint64(2 * count)",
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
-            *indent([*self._place, self._base, *indented("for i in range(size):", start)]),
+            *indent([*self._place, self._base, *indented(EACH_LANE, start)]),
         ]  # fmt: skip
         return compiled_lines(
             "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body

@@ -12,9 +12,7 @@ from typing import Any
 
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.whole import WholeProgram
-from lag_envs.envs.lines import indent, indented
-
-_LANE = "for i in range(size):"
+from lag_envs.envs.lines import EACH_LANE, indent, indented
 
 
 class DividedProgram(WholeProgram):
@@ -84,14 +82,14 @@ class DividedProgram(WholeProgram):
     def _move_lanes(self) -> list[str]:
         look = self._look
         return [
-            *indented(_LANE, self._begin_step),
+            *indented(EACH_LANE, self._begin_step),
             "pieces = np.uint64(1)",
             "while pieces > 0:",
             *indent([
                 "pieces = np.uint64(0)",
-                *indented(_LANE, self._begin_piece),
+                *indented(EACH_LANE, self._begin_piece),
                 *(self._move_by_series if self.general else self._move_by_flow),
-                *(indented(_LANE, look) if look else []),
+                *(indented(EACH_LANE, look) if look else []),
             ]),
         ]  # fmt: skip
 
@@ -136,7 +134,7 @@ class DividedProgram(WholeProgram):
             "failed = select(going & (status < 0.0), 1.0, failed)",
         ]
         end = [*self._load_piece, going, *self._span, *self._advanced, *found, *self._end_piece]
-        return [*self._advance_lanes([*self._load_piece, going, *given]), *indented(_LANE, end)]
+        return [*self._advance_lanes([*self._load_piece, going, *given]), *indented(EACH_LANE, end)]
 
     @property
     def _move_by_flow(self) -> list[str]:
@@ -146,8 +144,8 @@ class DividedProgram(WholeProgram):
         first = [*self._load_piece, *self._span, *self._stepper.fast, *fast, *self._end_piece]
         second = [*self._load_piece, *self._span, *self._stepper.any_step, *slow, *self._end_piece]
         return [
-            *indented(_LANE, first),
-            *indented(_LANE, [*self._load(["moved"]), *indented("if moved == 2.0:", second)]),
+            *indented(EACH_LANE, first),
+            *indented(EACH_LANE, [*self._load(["moved"]), *indented("if moved == 2.0:", second)]),
         ]  # fmt: skip
 
     @property

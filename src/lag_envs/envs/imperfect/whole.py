@@ -9,7 +9,7 @@ from lag_envs.envs.imperfect.drawn import DrawnProgram
 from lag_envs.envs.imperfect.lagged import LaggedCode
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
-from lag_envs.envs.lines import indent, indented
+from lag_envs.envs.lines import EACH_LANE, indent, indented
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.rows import Rows
 from lag_envs.tasks.base import Task
@@ -91,13 +91,13 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _command_lanes(self) -> list[str]:
-        lane, delay = "for i in range(size):", self._actuators.delay(self._lane)
+        delay = self._actuators.delay(self._lane)
         perturb = [self._key, *self._load([*self.a, "n"]), *self._actuators.perturb, *self._store(self.a)]
         return [
-            *(indented(lane, perturb) if delay or self.options.action_noise else []),
+            *(indented(EACH_LANE, perturb) if delay or self.options.action_noise else []),
             # Not side by side: each environment has its own slot. One that is to be restarted has none.
             *(
-                indented(lane, [
+                indented(EACH_LANE, [
                     self._key, *self._load(["n"]),
                     "if n >= 0.0:", *indent([*self._load(self.a), *delay, *self._store(self.a)]),
                 ])
@@ -108,7 +108,7 @@ class WholeProgram(DrawnProgram):
 
     @property
     def _sense_lanes(self) -> list[str]:
-        lane, sensors, ordinary = "for i in range(size):", self._sensors, self._load(["ordinary"])
+        sensors, ordinary = self._sensors, self._load(["ordinary"])
         delay, clock = sensors.delay(self._lane), self._load(["clock"], ["n"])
         shown = f"stepped & ({sensors.due})" if sensors.due else "stepped"
         sense = [
@@ -121,7 +121,7 @@ class WholeProgram(DrawnProgram):
         ]  # fmt: skip
         return [
             *(
-                indented(lane, [
+                indented(EACH_LANE, [
                     *ordinary, "if ordinary == 1.0:",
                     *indent([
                         *clock, *self._load([*self.o, *sensors.taken]), *delay, *self._store(self.o),
@@ -130,7 +130,7 @@ class WholeProgram(DrawnProgram):
                 if delay
                 else []
             ),
-            *indented(lane, sense),
+            *indented(EACH_LANE, sense),
         ]  # fmt: skip
 
     @property
