@@ -113,6 +113,10 @@ class AcrobotExact(Task):
     reference = "switch"
     hyperparameters = {
         "ppo": {"gamma": 0.99},
+        "fast_ppo": {
+            "n_timesteps": 5e6, "n_envs": 128, "n_steps": 64, "n_epochs": 5, "gae_lambda": 0.98,
+            "ent_coef": 3e-3, "reward_scale": 0.03, "critic": [128, 128],
+        },
         "dqn": {  # near the RL Zoo's for Gymnasium's
             "learning_rate": 6.3e-4, "batch_size": 128, "buffer_size": 50_000, "target_update_interval": 250,
             "gradient_steps": 4, "exploration_fraction": 0.12, "exploration_final_eps": 0.1,

@@ -259,7 +259,7 @@ class CartPoleContinuous(_OnTrack):
     reference = "LQR"
     hyperparameters = {
         "ppo": {"gamma": 0.98},
-        "fast_ppo": {"gamma": 0.98},
+        "fast_ppo": {"n_timesteps": 5e6, "gamma": 0.98},
         "off_policy": {"gamma": 0.98},
         # Large noise, kept for long, tips the pole over.
         "td3": {
