@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 import lag_envs.hyperparams
 from agents.run import (
@@ -41,6 +40,7 @@ from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
 from lag_envs.leaderboard.export import LOADING
 from lag_envs.leaderboard.fields import Strict, checked
+from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write_file
 from lag_envs.tasks.base import Task
@@ -155,9 +155,17 @@ def trainable(env_id: str) -> Task:
 # --- environments and learner -------------------------------------------------------------------------------
 
 
-def make_envs(run: Run) -> Any:
-    """Return the native vector environment with the wrappers that the hyperparameters ask for."""
-    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+def make_envs(run: Run, normalise: Any = None) -> Any:
+    """Return the native vector environment with the wrappers that the hyperparameters ask for.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    normalise : VecNormalize, optional
+        The normalisation to continue with, without environments, in place of a new one.
+    """
+    from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
     from lag_envs.sb3 import DiscreteActions, ScaledReward, make_vec_env
 
@@ -188,11 +196,16 @@ def make_envs(run: Run) -> Any:
     envs = make_vec_env(run.env, int(hyper.get("n_envs", 1)), stagger=int(steps), **options)
     envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
     envs = envs if factor is None else ScaledReward(envs, factor)
-    normalise = hyper.get("normalize")
-    if normalise:
-        which = normalise if isinstance(normalise, dict) else {}
+    if normalise is not None:
+        normalise.set_venv(envs)
+        envs = normalise
+    elif which := hyper.get("normalize"):
+        which = which if isinstance(which, dict) else {}
         envs = VecNormalize(envs, gamma=float(hyper.get("gamma", 0.99)), **which)
-    return envs
+    frames = hyper.get("frame_stack")
+    if frames and getattr(envs, "norm_obs", False):
+        raise UserError("frame_stack does not go with normalised observations: set norm_obs to false")
+    return VecFrameStack(envs, frames) if frames else envs
 
 
 def make_model(run: Run, envs: Any) -> Any:
@@ -204,7 +217,7 @@ def make_model(run: Run, envs: Any) -> Any:
     # The networks are too small for several threads: a second one costs more than it gains.
     torch.set_num_threads(1)
     own = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs")
-    own += ("noise_type", "noise_std")
+    own += ("noise_type", "noise_std", "frame_stack")
     # A copy, for learners write into what they are given.
     arguments = deepcopy({k: v for k, v in run.hyperparameters.items() if k not in own})
     for name in ("learning_rate", "clip_range"):
@@ -254,12 +267,9 @@ def thaw(run: Run, content: Mapping[str, Any]) -> Any:
     import torch
 
     torch.set_num_threads(1)
-    envs = make_envs(run)
     try:
         normalise, buffer = pickle.loads(content["normalisation"]), pickle.loads(content["buffer"])
-        if normalise is not None:
-            normalise.set_venv(envs.venv)
-            envs = normalise
+        envs = make_envs(run, normalise)
         log = str(run.path("tensorboard"))
         model = learner(run.algo).load(
             io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log, **LOADING
@@ -300,6 +310,7 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
     model.get_env().reset()  # compiles
     # Every seed has different episodes throughout, and so does a resumed run.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
+    task, frames = make_task(run.env), run.hyperparameters.get("frame_stack") or 1
     every = run.steps / TESTS
 
     class Watch(BaseCallback):
@@ -325,7 +336,8 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-            mean = play(run.env, LearnedPolicy(self.model, bins=numbered(run.hyperparameters)), seeds).mean()
+            policy = ModelPolicy(self.model, task, self.model.get_vec_normalize_env(), frames)
+            mean = play(run.env, policy, seeds).mean()
             run.trained = self.last = self.num_timesteps
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
             if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
@@ -388,7 +400,9 @@ def finish_training(run: Run, best: Mapping[str, Any]) -> None:
     if normalise is not None and normalise.norm_obs:
         write_file(run.path(NORMALISATION), best["normalisation"])
     model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu", **LOADING)
-    evaluate_finished(run, LearnedPolicy(model, normalise, numbered(run.hyperparameters)), best["trained"])
+    frames = run.hyperparameters.get("frame_stack") or 1
+    policy = ModelPolicy(model, make_task(run.env), normalise, frames)
+    evaluate_finished(run, policy, best["trained"])
 
 
 def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
@@ -419,46 +433,6 @@ def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
 # --- policies -----------------------------------------------------------------------------------------------
 
 
-class LearnedPolicy:
-    """A learner's policy as it acts in the environments themselves: observations in, actions in [-1, 1] out.
-
-    Parameters
-    ----------
-    model : BaseAlgorithm
-        A learner; if its environments normalise observations, so does the policy.
-    normalise : VecNormalize, optional
-        The normalisation, for a learner that was loaded without environments.
-    bins : bool
-        Whether action numbers stand for parts of [-1, 1] instead of being the environment's own actions.
-    """
-
-    def __init__(self, model: Any, normalise: Any = None, bins: bool = True) -> None:
-        self.model = model
-        if normalise is None and model.get_env() is not None:
-            normalise = model.get_vec_normalize_env()
-        self.normalise = normalise if normalise is not None and normalise.norm_obs else None
-        self.bins = bins
-
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray[np.float32], Any]:
-        """Return the action, for each observation."""
-        if self.normalise is not None:
-            observation = self.normalise.normalize_obs(observation)
-        action, state = self.model.predict(observation, state, episode_start, deterministic)
-        bins = getattr(self.model.action_space, "n", None)
-        if self.bins and bins is not None:
-            from lag_envs.leaderboard.networks import bin_centres
-
-            action = bin_centres(int(bins)).astype(np.float32)[np.asarray(action)][..., None]
-        return action, state
-
-
-def numbered(hyper: dict[str, Any]) -> bool:
-    """Return whether a wrapper numbers the actions."""
-    return any(DISCRETISE in wrapper for wrapper in hyper.get("env_wrapper", []))
-
-
 def load_policy(folder: Path) -> Any:
     """Return the policy of a finished run.
 
@@ -479,4 +453,5 @@ def load_policy(folder: Path) -> Any:
         raise UserError(
             f"the policy in {folder} cannot be read ({reason}); train it again, with --new"
         ) from error
-    return LearnedPolicy(model, normalise, numbered(result["hyperparameters"]))
+    frames = result["hyperparameters"].get("frame_stack") or 1
+    return ModelPolicy(model, make_task(result["env"]), normalise, frames)

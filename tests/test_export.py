@@ -10,6 +10,7 @@ from small_submissions import ABOUT, ENV, network
 
 from agents import measure
 from lag_envs import sb3_policies
+from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.leaderboard.submission import load, write
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.record import Goal
@@ -17,12 +18,12 @@ from lag_envs.tasks.record import Goal
 SLOW = pytest.mark.slow
 
 
-def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
+def model(algo, seed=0, bins=0, frames=0, normalise=False, env_id=ENV, **options):
     """Return an untrained model with steep layers, and its normalisation, as a training would leave them."""
     sb3 = pytest.importorskip("stable_baselines3")
     import gymnasium as gym
     import torch
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
     import lag_envs  # noqa: F401  (registers the environments)
 
@@ -32,6 +33,7 @@ def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
 
     torch.set_num_threads(1)
     env = DummyVecEnv([make])
+    env = VecFrameStack(env, frames) if frames else env
     if normalise:
         env = VecNormalize(env)
         env.seed(seed)
@@ -57,6 +59,8 @@ def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
         ("PPO", {"use_sde": True, "normalise": True}),
         ("PPO", {"use_sde": True, "policy_kwargs": {"squash_output": True, "net_arch": [8, 5]}}),
         ("PPO", {"bins": 5, "policy_kwargs": {"net_arch": []}}),
+        ("PPO", {"frames": 3, "normalise": True}),
+        slow("DQN", {"frames": 2, "bins": 5, "policy_kwargs": {"net_arch": [8]}}),
         pytest.param("A2C", {}, marks=SLOW),
         ("SAC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}),
         pytest.param("SAC", {"normalise": True, "policy_kwargs": {"net_arch": [16]}}, marks=SLOW),
@@ -76,16 +80,19 @@ def test_export_acts_as_the_model(algo, options, tmp_path):
     result = {"algo": algo.lower()} if "kind" in options else None
     found = algorithm_of(Source(tmp_path / "model.zip", result=result))
     assert found == {"DDPG": "td3"}.get(algo, algo.lower())
-    table, arrays = convert(made, normalise)
+    frames = options.get("frames", 1)
+    table, arrays = convert(made, TASKS[ENV](), normalise, frames)
     agent = network(tmp_path / "a", table, arrays).policies[0][1].agent()
-    off, count = difference(made, normalise, agent, ENV)
+    policy = ModelPolicy(made, TASKS[ENV](), normalise, frames)
+    off, count = difference(policy, agent, ENV)
     assert off <= 1e-5 and count == 16_384
     if algo == "SAC" and "use_sde" in options:
         assert table["mean_limit"] == 2.0
+    assert table.get("frames", 1) == frames
     # A change that can be felt is noticed.
     arrays["weight_0"] = -arrays["weight_0"]
     agent = network(tmp_path / "b", table, arrays).policies[0][1].agent()
-    assert difference(made, normalise, agent, ENV)[0] > 1e-3
+    assert difference(policy, agent, ENV)[0] > 1e-3
 
 
 @pytest.mark.parametrize("algo", ["PPO", "DQN"])
@@ -95,13 +102,14 @@ def test_export_of_a_model_that_chooses_what_the_environment_lists(algo, tmp_pat
     env = next(env_id for env_id, task in TASKS.items() if len(task().formulas.choices) == 1)
     monkeypatch.setattr(TASKS[env], "goal", Goal("success: none is asked for", hold=None))  # gives it a board
     made, _ = model(algo, env_id=env, policy_kwargs={"net_arch": [8]})
-    table, arrays = convert(made, listed=True)
+    table, arrays = convert(made, TASKS[env]())
     assert not {"bins", "squash"} & set(table)
     agent = network(tmp_path / "a", table, arrays, env=env).policies[0][1].agent()
-    assert difference(made, None, agent, env) == (0.0, 16_384)
+    policy = ModelPolicy(made, TASKS[env]())
+    assert difference(policy, agent, env) == (0.0, 16_384)
     arrays["weight_0"] = -arrays["weight_0"]
     agent = network(tmp_path / "b", table, arrays, env=env).policies[0][1].agent()
-    assert difference(made, None, agent, env)[0] == 1.0
+    assert difference(policy, agent, env)[0] == 1.0
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +170,7 @@ def test_command_exports_files(runs, tmp_path):
     given += ["--seconds", 5]
     with pytest.raises(UserError, match="one file for each path"):
         export_command(*given, "--normalise", norms[0])
-    with pytest.raises(UserError, match=f"do not fit {incline.Brake.id}"):
+    with pytest.raises(UserError, match="do not fit Brake"):
         export_command(*given, "--env", incline.Brake.id)
     with pytest.raises(UserError, match="there is no environment 'x'"):
         export_command(*given, "--env", "x")
@@ -179,7 +187,11 @@ def test_models_that_cannot_be_exported(runs, tmp_path):
 
     made, _ = model("PPO", policy_kwargs={"activation_fn": torch.nn.Hardswish})
     with pytest.raises(ExportError, match="all activations must be one of"):
-        convert(made)
+        convert(made, TASKS[ENV]())
+    with pytest.raises(
+        ExportError, match=r"sees .* numbers, which do not fit Tilt with .* and 3 frames; --frames"
+    ):
+        convert(made, TASKS[ENV](), frames=3)
     with pytest.raises(ExportError, match="is neither a model nor a folder"):
         find([tmp_path])
     (tmp_path / "x.zip").write_bytes(b"no zip")

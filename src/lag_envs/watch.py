@@ -99,7 +99,7 @@ def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = No
         )
     if (path / "submission.toml").is_file():
         return path.name, _submission(env_id, path)
-    return path.name, _model(env_id, path)
+    return path.name, _model(env_id, task, path)
 
 
 def _on_board(env_id: str, board: Path | None) -> dict[str, Path]:
@@ -131,9 +131,10 @@ def _submission(env_id: str, folder: Path) -> Any:
     return found.policies[0][1].agent()
 
 
-def _model(env_id: str, path: Path) -> Any:
+def _model(env_id: str, task: Any, path: Path) -> Any:
     """Return a model of Stable-Baselines3; loading it runs code."""
     from lag_envs.leaderboard import export
+    from lag_envs.leaderboard.sb3_models import ModelPolicy
 
     try:
         import stable_baselines3  # noqa: F401
@@ -144,46 +145,10 @@ def _model(env_id: str, path: Path) -> Any:
         model, normalise = export.load_model(source, export.algorithm_of(source))
     except export.ExportError as error:
         raise UserError(str(error)) from error
-    env = gym.make(env_id)
-    spaces = env.observation_space, env.action_space
-    env.close()
-    if model.observation_space.shape != spaces[0].shape:
-        raise UserError(
-            f"{path} observes {model.observation_space.shape} numbers, {env_id} has {spaces[0].shape}"
-        )
-    return SB3Model(model, normalise, spaces[1])
-
-
-class SB3Model:
-    """A Stable-Baselines3 model, given the environment's own observations and returning its actions.
-
-    Parameters
-    ----------
-    model : BaseAlgorithm
-        The model.
-    normalise : VecNormalize or None
-        Its normalisation of observations.
-    space : gym.Space
-        The environment's actions; those of a model that chooses among bins of them are converted.
-    """
-
-    def __init__(self, model: Any, normalise: Any, space: gym.Space) -> None:
-        self.model, self.normalise = model, normalise
-        self.centres: NDArray[np.float64] | None = None
-        if isinstance(space, gym.spaces.Box) and isinstance(model.action_space, gym.spaces.Discrete):
-            from lag_envs.leaderboard.networks import bin_centres
-
-            self.centres = bin_centres(int(model.action_space.n))
-
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Any, Any]:
-        """Return the action, and the memory of a recurrent model."""
-        seen = observation if self.normalise is None else self.normalise.normalize_obs(observation)
-        action, state = self.model.predict(seen, state, episode_start, deterministic=deterministic)
-        if self.centres is not None:
-            return np.array([self.centres[int(action)]], np.float32), state
-        return action, state
+    seen, own = model.observation_space.shape, source.frames * len(task.observation)
+    if seen != (own,):
+        raise UserError(f"{path} observes {seen} numbers, {env_id} has {own}")
+    return ModelPolicy(model, task, normalise, source.frames)
 
 
 # --- watching -----------------------------------------------------------------------------------------------

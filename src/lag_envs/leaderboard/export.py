@@ -12,7 +12,7 @@ import os
 import pickle
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.policies import architecture
+from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.leaderboard.submission import Refused, Submission, write
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
 
 #: Algorithms: where the class is, and the module that a model's file names for its policy.
 ALGORITHMS = {
@@ -50,11 +52,12 @@ class ExportError(Exception):
 
 @dataclass
 class Source:
-    """A model's files, and what is known of its training."""
+    """A model's files, what is known of its training, and how many observations it sees side by side."""
 
     model: Path
     normalise: Path | None = None
     result: Mapping[str, Any] | None = None
+    frames: int = 1
 
 
 # --- reading ------------------------------------------------------------------------------------------------
@@ -84,14 +87,10 @@ def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
         if not folders:
             raise ExportError(f"{path} is neither a model nor a folder with {MODEL} in it or one level below")
         for folder in folders:
-            result, norm = folder / RESULT, folder / NORMALISATION
-            found.append(
-                Source(
-                    folder / MODEL,
-                    norm if norm.exists() else None,
-                    _json(result) if result.exists() else None,
-                )
-            )
+            file, norm = folder / RESULT, folder / NORMALISATION
+            result = _json(file) if file.exists() else None
+            frames = (result or {}).get("hyperparameters", {}).get("frame_stack") or 1
+            found.append(Source(folder / MODEL, norm if norm.exists() else None, result, frames))
     return found
 
 
@@ -167,7 +166,7 @@ def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | No
 
 
 def convert(
-    model: Any, normalise: Any = None, listed: bool = False
+    model: Any, task: Task, normalise: Any = None, frames: int = 1
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return a model's policy as the table ``[policy]`` and its arrays.
 
@@ -175,10 +174,12 @@ def convert(
     ----------
     model : BaseAlgorithm
         A model of Stable-Baselines3; of its distribution the mode is taken.
+    task : Task
+        The task.
     normalise : VecNormalize, optional
         Its normalisation of observations.
-    listed : bool, optional
-        Whether the environment itself has actions to choose from, and not a wrapper.
+    frames : int
+        The number of observations that it sees side by side, as with `VecFrameStack`.
 
     Raises
     ------
@@ -187,8 +188,16 @@ def convert(
     """
     from gymnasium import spaces
 
-    policy, space = model.policy, model.action_space
+    policy, space, listed = model.policy, model.action_space, bool(task.formulas.choices)
     table: dict[str, Any] = {"architecture": "mlp"}
+    own, shape = len(task.observation), model.observation_space.shape
+    if shape != (frames * own,):
+        raise ExportError(
+            f"the model sees {shape} numbers, which do not fit {type(task).__name__} with {own} and "
+            f"{frames} frame{'s' * (frames > 1)}; --frames tells how many a model sees"
+        )
+    if frames > 1:
+        table["frames"] = frames
     discrete = isinstance(space, spaces.Discrete | spaces.MultiDiscrete if listed else spaces.Discrete)
     numbers = isinstance(space, spaces.Box) and len(space.shape) == 1
     if not discrete and not (numbers and len({*-space.low, *space.high}) == 1):
@@ -235,6 +244,8 @@ def convert(
     if not listed:
         table |= {"bins": int(space.n)} if discrete else {"squash": squash}
     if normalise is not None:
+        if normalise.obs_rms.mean.shape != shape:
+            raise ExportError("observations must be stacked before they are normalised, not after")
         table["normalise"] = {"epsilon": float(normalise.epsilon), "clip": float(normalise.clip_obs)}
         arrays["obs_mean"] = np.array(normalise.obs_rms.mean, np.float64)
         arrays["obs_var"] = np.array(normalise.obs_rms.var, np.float64)
@@ -249,7 +260,7 @@ def _flat(module: Any) -> list[Any]:
     return [] if type(module).__name__ in ("Identity", "Flatten", "Sequential", "list") else [module]
 
 
-def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[float, int]:
+def difference(policy: ModelPolicy, agent: Any, env_id: str) -> tuple[float, int]:
     """Return the largest difference of a model's actions and an agent's, and the number of observations.
 
     Half of the observations are on the way: of episodes in which the model acts, and of some in which actions
@@ -259,36 +270,34 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     """
     import gymnasium as gym
 
-    rng, seen = np.random.default_rng(0), []
-    choices = TASKS[env_id]().formulas.choices
-
-    def act(observation: NDArray) -> NDArray:
-        values = observation if normalise is None else normalise.normalize_obs(observation)
-        action = np.asarray(model.predict(values, deterministic=True)[0])
-        return action if agent_centres is None else agent_centres[action][:, None]
-
-    agent_centres = getattr(agent, "centres", None)
+    task = TASKS[env_id]()
+    rng, seen, choices = np.random.default_rng(0), [], task.formulas.choices
+    memory, over = None, np.zeros(64, np.bool_)
     envs = gym.make_vec(env_id, 64, autoreset_mode="SameStep")
     observation, _ = envs.reset(seed=0)
-    for _ in range(int(TASKS[env_id]().limit)):
-        seen.append(observation)
-        action = act(observation)
+    for _ in range(int(task.limit)):
+        action, memory = policy.predict(observation, memory, over)
+        seen.append(observation if memory is None else memory)
         if choices:
             action[48:] = rng.integers(0, choices, (16, len(choices))).reshape(16, *action.shape[1:])
         else:
-            action[48:] = rng.uniform(-1.0, 1.0, (16, *action.shape[1:]))
-        observation = envs.step(action)[0]
+            largest = task.formulas.largest
+            action[48:] = rng.uniform(-largest, largest, (16, *action.shape[1:]))
+        observation, _, terminated, truncated, _ = envs.step(action)
+        over = terminated | truncated
     envs.close()
     path = rng.permutation(np.concatenate(seen))[:8192]
     far = np.abs(path).max(axis=0)
     both = np.concatenate([path, rng.uniform(-far, far, path.shape).astype(path.dtype)])
-    model_action, action = act(both), agent.predict(both)[0]
+    frames = both.reshape(len(both), policy.frames, -1)
+    before = None if policy.frames == 1 else np.roll(frames, 1, axis=1).astype(np.float64)
+    worth = agent.layers.outputs(agent.layers.normalised(both.astype(np.float64)))
+    model_action, action = policy.actions(both)[0], agent.predict(frames[:, -1], before)[0]
     if choices:
-        return _lost(agent.outputs(both.astype(np.float64)), model_action, choices), len(both)
+        return _lost(worth, model_action, choices), len(both)
     off = np.abs(model_action.astype(np.float64) - action).max(axis=1)
-    if agent_centres is not None:
-        worth = agent.outputs(both.astype(np.float64))
-        chosen = np.abs(agent_centres - model_action).argmin(axis=1)
+    if policy.centres is not None:
+        chosen = np.abs(policy.centres - model_action).argmin(axis=1)
         lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
         off[lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))] = 0.0
     return float(off.max()), len(both)
@@ -314,25 +323,25 @@ class Exported:
         The table ``[policy]`` and its arrays.
     agent : object
         What acts, as on the board.
-    model, normalise : object or None
-        What it was made of; a file that holds arrays has neither.
+    policy : ModelPolicy or None
+        What it was made of; a file that holds arrays has no model.
     """
 
     table: dict[str, Any]
     arrays: dict[str, NDArray[Any]]
     agent: Any
-    model: Any = None
-    normalise: Any = None
+    policy: ModelPolicy | None = None
 
 
 def exported(source: Source, env: str, algo: str | None = None) -> Exported:
     """Return a model of an environment as a submission has it; raise ExportError where it cannot be one."""
-    model, normalise = None, None
+    policy = None
     if (ready := arrays_of(source.model)) is not None:
         table, arrays = ready
     else:
-        model, normalise = load_model(source, algo or algorithm_of(source))
-        table, arrays = convert(model, normalise, bool(TASKS[env]().formulas.choices))
+        task, (model, normalise) = TASKS[env](), load_model(source, algo or algorithm_of(source))
+        table, arrays = convert(model, task, normalise, source.frames)
+        policy = ModelPolicy(model, task, normalise, source.frames)
     try:
         made = architecture(env, table)
         shapes = {key: value.shape for key, value in arrays.items()}
@@ -341,7 +350,7 @@ def exported(source: Source, env: str, algo: str | None = None) -> Exported:
         agent = made.agent({k: v.astype(np.float64) for k, v in arrays.items()})
     except Refused as error:
         raise ExportError(f"{source.model}: {error}") from error
-    return Exported(table, arrays, agent, model, normalise)
+    return Exported(table, arrays, agent, policy)
 
 
 # --- exporting ----------------------------------------------------------------------------------------------
@@ -404,8 +413,8 @@ def export(
     tables, arrays, curves, steps, took, off, count = [], {}, [], [], [], 0.0, 0
     for number, source in enumerate(sources):
         made = exported(source, env, algo)
-        table, content, model = made.table, made.arrays, made.model
-        one, count = (0.0, 0) if model is None else difference(model, made.normalise, made.agent, env)
+        table, content, model = made.table, made.arrays, made.policy and made.policy.model
+        one, count = (0.0, 0) if made.policy is None else difference(made.policy, made.agent, env)
         if not one <= DIFFERENCE:
             raise ExportError(
                 f"{source.model}: model and export differ by {one:.1e} in an action, more than {DIFFERENCE:g}"
@@ -488,6 +497,10 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
         "--normalise", metavar="PKL", nargs="+", type=Path, default=[],
         help="pickled VecNormalize, one for each MODEL that is a file",
     )  # fmt: skip
+    add(
+        "--frames", metavar="N", type=int,
+        help="observations that they see side by side, as with VecFrameStack (default: as recorded, else 1)",
+    )  # fmt: skip
     add("--algo", choices=list(ALGORITHMS), help="default: detected")
     add("--code", metavar="URL", default="", help="https address of the code it was trained with")
     add("--description", metavar="TEXT", default="", help="a line about it")
@@ -503,6 +516,8 @@ def run_export(args: argparse.Namespace) -> int:
 
         torch.set_num_threads(1)  # such networks are too small to share out
         sources = find(args.models, args.normalise)
+        if args.frames is not None:
+            sources = [replace(source, frames=args.frames) for source in sources]
         known = args.env or _same("environment", [(s.result or {}).get("env") for s in sources], "--env")
         name = args.name or _name(sources[0], args.algo)
         submission, off, count = export(

@@ -243,11 +243,7 @@ class _Layers:
 class _Feedforward(Agent):
     def __init__(self, layers: _Layers) -> None:
         super().__init__(layers.head)
-        self.layers, self.centres = layers, layers.centres
-
-    def outputs(self, observations: Array) -> Array:
-        """Return the last layer's output, shape (n, outputs)."""
-        return self.layers.outputs(self.layers.normalised(observations))
+        self.layers = layers
 
     def act(self, observations: Array) -> Array:
         return self.layers.numbers(self.layers.normalised(observations))
