@@ -339,9 +339,12 @@ class Pump(_Shell):
     }
     hyperparameters = {
         "ppo": {**_PPO, "n_timesteps": 8e5, "normalize": True},
+        "fast_ppo": {
+            "n_timesteps": 5e6, "n_epochs": 5, "reward_scale": 1.0, "episode_share": 1.0, "actor": [64, 64],
+        },
         # A push pays some steps later, and costs at once.
         "off_policy": {"gamma": 0.98, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_2e-3"},
-    }
+    }  # fmt: skip
     value_iteration = ValueIteration(
         (
             Axis("θ [rad]", -1.3, 1.3, 56, level=2),

@@ -262,9 +262,13 @@ class PendulumRegret(_Rod):
     reference = "energy shaping + LQR"
     hyperparameters = {
         "ppo": {"gamma": 0.999},
-        "fast_ppo": {"gamma": 0.995, "episode_share": 1.0},
+        "fast_ppo": {
+            "n_timesteps": 3e6, "n_envs": 128, "n_steps": 64, "n_epochs": 5, "gamma": 0.995,
+            "gae_lambda": 0.98, "ent_coef": 3e-3, "reward_scale": 0.03, "state_noise": False,
+            "log_std_init": 0.5, "critic": [128, 128],
+        },
         "off_policy": {"n_timesteps": 8e4, "learning_rate": "lin_2e-3"},
-    }
+    }  # fmt: skip
     examples = dataclasses.replace(
         _Rod.examples,
         batch={
