@@ -140,9 +140,12 @@ class PendulumExact(_Rod):
     )
     hyperparameters = {
         "ppo": {"gamma": 0.95},
-        "fast_ppo": {"gamma": 0.95, "episode_share": 1.0},
+        "fast_ppo": {
+            "n_timesteps": 2e6, "batch_size": 1024, "gamma": 0.97, "gae_lambda": 0.98, "clip_range": 0.1,
+            "noise_steps": 1, "log_std_init": -0.5, "actor": [64, 64], "first_layer_scale": 3.0,
+        },
         "off_policy": {"gamma": 0.98, "n_timesteps": 6e4},
-    }
+    }  # fmt: skip
     examples = dataclasses.replace(
         _Rod.examples,
         batch={

@@ -333,7 +333,7 @@ class SwingUpUnknown(SwingUp):
     hyperparameters = {
         **SwingUp.hyperparameters,
         "fast_ppo": {
-            "n_timesteps": 2e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
+            "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
             "reward_scale": 1.0, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
             "first_layer_scale": 3.0,
         },

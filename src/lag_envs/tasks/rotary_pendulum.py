@@ -109,7 +109,7 @@ class RotarySwingUp(Task):
     hyperparameters = {
         "ppo": {"gamma": 0.99},
         "fast_ppo": {
-            "n_timesteps": 5e5, "n_steps": 32, "gamma": 0.97, "max_grad_norm": 1.0, "reward_scale": 1.0,
+            "n_timesteps": 5e6, "n_steps": 32, "gamma": 0.97, "max_grad_norm": 1.0, "reward_scale": 1.0,
             "state_noise": False, "log_std_init": 0.5, "critic": [64, 64],
         },
     }  # fmt: skip
