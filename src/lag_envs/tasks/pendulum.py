@@ -108,7 +108,7 @@ class PendulumExact(_Rod):
 
     ## Known Returns
 
-    The optimum is not known.
+    The optimum is not known. docs/agents.md has the estimate of value iteration.
 
     ## Version History
 
@@ -157,7 +157,11 @@ class PendulumExact(_Rod):
         "The motor can hold the rod only within some 24 degrees of upright, so energy must be pumped in "
         "first."
     )
-    note = "Energy shaping, which hands over to an LQR near upright, is best. Nothing else was tried."
+    note = (
+        "The greedy policy of value iteration is best: from each start it knows how many swings are enough. "
+        "Energy shaping, which hands over to an LQR near upright, often takes one swing more. The learners "
+        "lie between the two."
+    )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosθ, sinθ and the clipped θ'."""
