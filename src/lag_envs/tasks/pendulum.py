@@ -158,9 +158,9 @@ class PendulumExact(_Rod):
         "first."
     )
     note = (
-        "The greedy policy of value iteration is best: from each start it knows how many swings are enough. "
-        "Energy shaping, which hands over to an LQR near upright, often takes one swing more. The learners "
-        "lie between the two."
+        "The greedy policy of value iteration is best. Energy shaping, which hands over to an LQR near "
+        "upright, takes as many swings, but arrives later: its torque fades as the energy gets near that of "
+        "upright. The learners lie between the two."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
