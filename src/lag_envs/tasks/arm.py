@@ -96,8 +96,8 @@ class Reach(Task):
     hyperparameters = {
         "ppo": {"gamma": 0.98},
         "fast_ppo": {
-            "n_timesteps": 5e5, "n_epochs": 5, "gamma": 0.98, "reward_scale": 1.0, "episode_share": 1.0,
-            "actor": [64, 64],
+            "n_timesteps": 2e6, "n_steps": 128, "n_epochs": 5, "gamma": 0.98, "max_grad_norm": 0.5,
+            "reward_scale": 1.0, "actor": [64, 64],
         },
         "off_policy": {"gamma": 0.98, "n_steps": 4, "gradient_steps": 4, "learning_rate": "lin_2e-3"},
         "td3": {"policy_kwargs": {"noise": 0.3}},

@@ -584,7 +584,7 @@ class Balance(_ChainTask):
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 1e6, "gae_lambda": 0.8, "max_grad_norm": 1.0, "reward_scale": 1.0,
+            "n_timesteps": 2e7, "gae_lambda": 0.8, "max_grad_norm": 1.0, "reward_scale": 1.0,
             "critic": [64, 64],
         },
         # Large noise, kept for long, tips the bars over.
