@@ -310,7 +310,6 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
     model.get_env().reset()  # compiles
     # Every seed has different episodes throughout, and so does a resumed run.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
-    task, frames = make_task(run.env), run.hyperparameters.get("frame_stack") or 1
     every = run.steps / TESTS
 
     class Watch(BaseCallback):
@@ -336,8 +335,8 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-            policy = ModelPolicy(self.model, task, self.model.get_vec_normalize_env(), frames)
-            mean = play(run.env, policy, seeds).mean()
+            normalise = self.model.get_vec_normalize_env()
+            mean = play(run.env, policy_of(run.settings, self.model, normalise), seeds).mean()
             run.trained = self.last = self.num_timesteps
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
             if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
@@ -400,9 +399,7 @@ def finish_training(run: Run, best: Mapping[str, Any]) -> None:
     if normalise is not None and normalise.norm_obs:
         write_file(run.path(NORMALISATION), best["normalisation"])
     model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu", **LOADING)
-    frames = run.hyperparameters.get("frame_stack") or 1
-    policy = ModelPolicy(model, make_task(run.env), normalise, frames)
-    evaluate_finished(run, policy, best["trained"])
+    evaluate_finished(run, policy_of(run.settings, model, normalise), best["trained"])
 
 
 def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
@@ -433,6 +430,12 @@ def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
 # --- policies -----------------------------------------------------------------------------------------------
 
 
+def policy_of(settings: Mapping[str, Any], model: Any, normalise: Any) -> ModelPolicy:
+    """Return a model of Stable-Baselines3 as a policy, by its run's settings."""
+    frames = settings["hyperparameters"].get("frame_stack") or 1
+    return ModelPolicy(model, make_task(settings["env"]), normalise, frames)
+
+
 def load_policy(folder: Path) -> Any:
     """Return the policy of a finished run.
 
@@ -453,5 +456,4 @@ def load_policy(folder: Path) -> Any:
         raise UserError(
             f"the policy in {folder} cannot be read ({reason}); train it again, with --new"
         ) from error
-    frames = result["hyperparameters"].get("frame_stack") or 1
-    return ModelPolicy(model, make_task(result["env"]), normalise, frames)
+    return policy_of(result, model, normalise)

@@ -147,6 +147,19 @@ def test_normalised_observations_belong_to_the_policy(tmp_path):
     assert play(ENV, policy, run.fresh_seeds(3)).tolist() != expected
 
 
+def test_a_policy_may_see_several_observations_side_by_side(tmp_path):
+    going = make_run(tmp_path, frame_stack=3, env_wrapper=[])
+    assert not go(going, 150)
+    going = make_run(tmp_path, frame_stack=3, env_wrapper=[])
+    assert go(going)
+    policy, expected = load_policy(tmp_path), json.loads(going.path(run.RESULT).read_text())["evaluation"]
+    assert policy.model.observation_space.shape == (3 * len(TASKS[ENV]().observation),)
+    returns = one_by_one(ENV, policy, run.fresh_seeds(3))
+    np.testing.assert_allclose(returns, expected["returns"], rtol=1e-4)
+    with pytest.raises(UserError, match="frame_stack does not go with normalised observations"):
+        go(make_run(tmp_path / "other", frame_stack=3, normalize=True))
+
+
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_hyperparameters_are_there_for_every_environment(algo):
     entries = yaml.safe_load(printed(algo))
