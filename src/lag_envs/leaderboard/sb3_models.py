@@ -42,7 +42,7 @@ class ModelPolicy:
         if state is None:
             state = np.zeros((*observation.shape[:-1], self.frames * self.width), observation.dtype)
         elif episode_start is not None:
-            fresh = np.reshape(episode_start, (*observation.shape[:-1], 1))
+            fresh = np.resize(episode_start, (*observation.shape[:-1], 1))
             state = np.where(fresh, state.dtype.type(0), state)
         state = np.concatenate([state[..., self.width :], observation], axis=-1)
         return self.actions(state, None, episode_start, deterministic)[0], state
