@@ -133,9 +133,10 @@ def test_what_still_ends_as_well_is_kept(monkeypatch):
 
 
 def test_what_cannot_work_is_refused():
-    for task, name in ((pendulum.PendulumExact(), "PendulumExact"), (Deliver(), "Deliver")):
-        with pytest.raises(ValueError, match=f"listed actions; those of {name} lie in a range: use MPC"):
-            BeamSearch(task)
+    for kind in (pendulum.PendulumExact, Deliver):
+        reason = f"listed actions; those of {kind.__name__} lie in a range: use MPC"
+        with pytest.raises(ValueError, match=reason):
+            BeamSearch(kind())
     task = cart_pole.CartPoleExact()
     for numbers, reason in (
         ({"horizon": 0}, "horizon must be at least 1, got 0"),

@@ -106,8 +106,8 @@ class BeamSearch:
     ) -> None:
         if not task.formulas.choices:
             raise ValueError(
-                f"beam search takes listed actions; those of {type(task).__name__} lie in a range: use MPC or "
-                "ILQR"
+                f"beam search takes listed actions; those of {type(task).__name__} lie in a range: "
+                "use MPC or ILQR"
             )
         every = horizon if every is None else every
         for name, number in (("horizon", horizon), ("width", width), ("every", every), ("pause", pause)):
