@@ -9,6 +9,7 @@ import pytest
 from own_tasks import Switched
 
 from lag_envs import register
+from lag_envs.controllers.basic import Choice
 from lag_envs.controllers.tracking import Tracking
 from lag_envs.evaluation.conditions import often
 from lag_envs.evaluation.rollout import play
@@ -30,6 +31,7 @@ TRAINING = {"env_steps": 1000, "seconds": 2.5, "hardware": "abacus"}
 NET = {"architecture": "mlp", "hidden": [3], "squash": "clip"}
 PLAN = {"architecture": "plan"}
 AHEAD = {"architecture": "mpc", "horizon": 25, "guesses": 4, "budget": 2_000}
+BEAM = {"architecture": "mpc", "horizon": 20, "budget": 4_000}
 UNIT = {"architecture": "gru", "memory": 5, "squash": "tanh"}
 
 
@@ -107,6 +109,17 @@ def seen(env, n, steps=6):
     envs.action_space.seed(3)
     first, _ = envs.reset(seed=5)
     return np.array([first, *(envs.step(envs.action_space.sample())[0] for _ in range(steps - 1))])
+
+
+def played_alone(env, agent, steps):
+    """Return what the first steps of an episode pay."""
+    alone, memory, total = gym.make(env), None, 0.0  # quicker to compile than a batch
+    observation, _ = alone.reset(seed=5)
+    for _ in range(steps):
+        action, memory = agent.predict(observation, memory)
+        observation, reward, _, _, _ = alone.step(action)
+        total += reward
+    return total
 
 
 EVERY = [
@@ -268,6 +281,22 @@ def test_one_who_plans_ahead_is_the_same_again(tmp_path):
     assert (returns[0] == returns[1]).all() and returns[0].mean() > 80.0  # of 100
 
 
+@pytest.mark.parametrize("env", [LISTED, pytest.param(LISTS, marks=pytest.mark.slow)])
+def test_one_who_plans_among_listed_actions_is_the_same_again(tmp_path, env):
+    policy = BEAM | {"every": 5, "energy": 1e-3, "cell": 0.3}
+    made = submission(tmp_path / "a", env, policy, arrays=None)
+    assert made.kind == "controller" and made.architecture.plans and made.architecture.schema == 2
+    planner, count = made.policies[0][1].agent(), math.prod(TASKS[env]().formulas.choices)
+    assert (planner.horizon, planner.every, planner.cell) == (20, 5, 0.3)
+    assert planner.width == (4_000 // 20 - 1) // count
+    taken, model = [], planner.model
+    planner.model = lambda states, *given: taken.append(len(states)) or model(states, *given)
+    planner.search(np.array([math.pi] * len(TASKS[env]().scene.state_names)))
+    assert sum(taken) <= 4_000
+    returns = [played_alone(env, made.policies[0][1].agent(), 40) for _ in range(2)]
+    assert returns[0] == returns[1] > played_alone(env, Choice(TASKS[env]()), 40)
+
+
 # --- hostile ------------------------------------------------------------------------------------------------
 
 
@@ -294,7 +323,13 @@ def test_one_who_plans_ahead_is_the_same_again(tmp_path):
         (LISTED, NET, "squash means nothing where actions are listed"),
         (LISTED, {"architecture": "mlp", "hidden": [], "bins": 3}, "bins means nothing where actions"),
         (LISTED, {"architecture": "plan"}, "plans are for actions in a range"),
-        (LISTED, AHEAD, "planning ahead is for tasks with one action, in a range"),
+        (LISTED, AHEAD, "guesses means nothing where actions are listed; leave it out"),
+        (LISTED, BEAM | {"seed": 0}, "seed means nothing where actions are listed"),
+        (LISTED, BEAM | {"budget": 79}, "with 3 actions takes a budget of at least 80 model steps, got 79"),
+        (LISTED, BEAM | {"budget": 20_001, "every": 2}, "at most 10000 are allowed; plan less"),
+        (LISTED, BEAM | {"weights": {"x": 1.0}}, "weights must name entries of the state, s, "),
+        (LISTED, BEAM | {"cell": 0.0}, "cell: Input should be greater"),
+        (incline.Tilt.id, AHEAD | {"energy": 1.0}, "energy means nothing where actions lie in a range"),
         (RANGES, AHEAD, "planning ahead is for tasks with one action"),
         (incline.Tilt.id, AHEAD | {"horizon": 251}, "horizon: Input should be less"),
         (incline.Tilt.id, AHEAD | {"budget": 10**7}, "budget: Input should be less"),

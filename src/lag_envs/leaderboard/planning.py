@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import Field
 
+from lag_envs.controllers.beam import beam
 from lag_envs.controllers.ilqr import SHARES
 from lag_envs.controllers.mpc import MPC
 from lag_envs.controllers.swing_up import away
@@ -18,6 +20,8 @@ from lag_envs.tasks import TASKS
 
 Number = Annotated[float, between(-1e6, 1e6)]
 Weight = Annotated[float, between(0.0, 1e6)]
+#: Keys that mean something only where actions lie in a range, and only where they are listed.
+RANGED, LISTED = {"iterations", "guesses", "good", "seed"}, {"cell", "energy"}
 
 
 class MPCTable(PolicyTable):
@@ -31,6 +35,8 @@ class MPCTable(PolicyTable):
     pause: Annotated[int, between(1, 1_000)] = 10
     good: Weight | None = None
     seed: Annotated[int, between(0, 2**31)] = 0
+    cell: Annotated[float, between(1e-3, 10.0)] = 0.2
+    energy: Number = 0.0
     weights: dict[str, Weight] = Field(default={})
     rest: dict[str, Number] = Field(default={})
 
@@ -43,6 +49,10 @@ class PlanAhead(Architecture):
     between searches); `good` (a final cost above which another search follows; without it there is only one);
     `seed` (of the guesses); and the tables `weights` and `rest`, by entry of the state: the final cost of the
     squared distance from rest. There are no arrays.
+
+    Where actions are listed, it is `lag_envs.controllers.beam.BeamSearch`, whose width follows from `budget`.
+    `cell` (edge of a cell) and `energy` (factor of the energy in the final cost) take the place of
+    `iterations`, `guesses`, `good` and `seed`; without `every`, a plan is followed to its end.
     """
 
     table = MPCTable
@@ -52,8 +62,12 @@ class PlanAhead(Architecture):
 
     def __init__(self, env_id: str, table: MPCTable) -> None:
         self.task = task = TASKS[env_id]()
-        if task.formulas.choices or task.formulas.actions != 1:
-            raise Refused(f"{POLICY}: planning ahead is for tasks with one action, in a range")
+        listed = bool(task.formulas.choices)
+        if not listed and task.formulas.actions != 1:
+            raise Refused(f"{POLICY}: planning ahead is for tasks with one action, or with listed ones")
+        for key in sorted((RANGED if listed else LISTED) & table.model_fields_set):
+            where = "are listed" if listed else "lie in a range"
+            raise Refused(f"{POLICY}: {key} means nothing where actions {where}; leave it out")
         for key, entries in (("weights", table.weights), ("rest", table.rest)):
             for name in entries:
                 if name not in task.scene.state_names:
@@ -61,16 +75,36 @@ class PlanAhead(Architecture):
                     raise Refused(
                         f"{POLICY}: {key} must name entries of the state, {known}; got {name!a:.80}"
                     )
-        steps = table.horizon * (1 + len(SHARES) * table.iterations) / min(table.every, table.horizon)
+        self.arrays = {}
+        every = min(table.every, table.horizon)
+        if listed:
+            self._beam(table)
+            steps = table.budget / every if "every" in table.model_fields_set else 0.0
+        else:
+            steps = table.horizon * (1 + len(SHARES) * table.iterations) / every
         if steps > protocol.MODEL_STEPS:
             raise Refused(
                 f"{POLICY}: renewing plans takes {steps:.0f} steps of the model per step of the environment, "
                 f"at most {protocol.MODEL_STEPS} are allowed; plan less far, or less often"
             )
-        self.numbers = table.model_dump(exclude={"architecture", "weights", "rest"}, exclude_none=True)
-        self.tail = away(task, table.weights, table.rest) if table.weights else None
-        self.arrays = {}
+        if not listed:
+            left_out = {"architecture", "weights", "rest", *LISTED}
+            self.numbers = table.model_dump(exclude=left_out, exclude_none=True)
+            self.numbers["tail"] = away(task, table.weights, table.rest) if table.weights else None
+
+    def _beam(self, table: MPCTable) -> None:
+        """Set the numbers of a beam search: its width, and what else the table states."""
+        count = math.prod(self.task.formulas.choices)
+        # A plan that was found is stepped once more.
+        width = (table.budget // table.horizon - 1) // count
+        if width < 1:
+            raise Refused(
+                f"{POLICY}: a search of {table.horizon} steps with {count} actions takes a budget of at "
+                f"least {table.horizon * (count + 1)} model steps, got {table.budget}"
+            )
+        given = table.model_dump(include=table.model_fields_set - {"architecture", "budget"})
+        self.numbers = given | {"width": width}
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:
         """Return a planner without a plan yet."""
-        return MPC(self.task, self.tail, **self.numbers)
+        return (beam if self.task.formulas.choices else MPC)(self.task, **self.numbers)

@@ -82,7 +82,9 @@ class AcrobotExact(Task):
 
     ## Known Returns
 
-    The optimum is not known.
+    The optimum is not known. The best known plans come from a beam search on the exact model, which ranks
+    states by their energy. From the hanging starts they take about 59 steps; a search many times as wide
+    saves less than one. Learners take some 25 steps more.
 
     ## Version History
 
@@ -108,7 +110,8 @@ class AcrobotExact(Task):
         "switch": Controller(
             "lag_envs.controllers.basic:Switch",
             {"weights": {"sin(theta_1)": 1.3, "theta_1_dot": -0.3, "sin(theta_2)": -0.3, "theta_2_dot": 0.9}},
-        )
+        ),
+        "beam search": Controller("lag_envs.controllers.beam:beam", {"energy": 1.0}, plans=True),
     }
     reference = "switch"
     hyperparameters = {
@@ -131,7 +134,10 @@ class AcrobotExact(Task):
     difficulty = "The elbow's torque is far too weak to lift the links, so they have to be swung."
     note = (
         "The switch takes the torque's sign from a weighted sum of observations, with weights found by "
-        "random search. It never plans ahead."
+        "random search. It never plans ahead. The beam search does, on the exact model: of the states that "
+        "it can reach, it follows those with the most energy, of each neighbourhood one. It reaches the line "
+        "much earlier than the switch and all learners. Nothing proves its plans the shortest, but much "
+        "wider searches hardly shorten them."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

@@ -138,7 +138,17 @@ class CartPoleExact(_OnTrack):
         "LQR": Controller(
             "lag_envs.controllers.linear:Regulator",
             {"weights": {"x": 0.1, "x_dot": 0.1, "theta": 10.0, "theta_dot": 0.1}, "effort": 0.01},
-        )
+        ),
+        "beam search": Controller(
+            "lag_envs.controllers.beam:beam",
+            {
+                "weights": {"x": 0.1, "x_dot": 0.1, "theta": 10.0, "theta_dot": 0.1},
+                "horizon": 40,
+                "width": 50,
+                "every": 20,
+            },
+            plans=True,
+        ),
     }
     reference = "LQR"
     hyperparameters = {
@@ -160,7 +170,10 @@ class CartPoleExact(_OnTrack):
         },
     )
     difficulty = "The pole falls within a second unless it is caught, and there is no push of strength zero."
-    note = "The sign of an LQR's control gives the push; this reaches the largest return."
+    note = (
+        "The sign of an LQR's control gives the push; this reaches the largest return. So does the beam "
+        "search, which plans less than a second ahead."
+    )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return the state; place and angle clipped to the space."""
