@@ -136,8 +136,8 @@ class AcrobotExact(Task):
         "The switch takes the torque's sign from a weighted sum of observations, with weights found by "
         "random search. It never plans ahead. The beam search does, on the exact model: of the states that "
         "it can reach, it follows those with the most energy, of each neighbourhood one. It reaches the line "
-        "much earlier than the switch and all learners. Nothing proves its plans the shortest, but much "
-        "wider searches hardly shorten them."
+        "first. Nothing proves its plans the shortest, but much wider searches hardly shorten them. The PPO "
+        "in one file comes close to it; it takes more steps than the other learners, and less time."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
