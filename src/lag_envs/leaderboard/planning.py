@@ -8,8 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from lag_envs.controllers.ilqr import SHARES
-from lag_envs.controllers.mpc import MPC
-from lag_envs.controllers.swing_up import away
+from lag_envs.controllers.mpc import planner
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
 from lag_envs.leaderboard.fields import between
@@ -36,7 +35,7 @@ class MPCTable(PolicyTable):
 
 
 class PlanAhead(Architecture):
-    """Model-predictive control: `lag_envs.controllers.mpc.MPC` with the table's numbers.
+    """Model-predictive control: `lag_envs.controllers.mpc.planner` with the table's numbers.
 
     In the table: `horizon` (steps); `every` (steps between new plans); `iterations` (of iLQR for each);
     `guesses` and `budget` (plans that a search improves, and its limit of model steps); `pause` (steps
@@ -52,8 +51,8 @@ class PlanAhead(Architecture):
 
     def __init__(self, env_id: str, table: MPCTable) -> None:
         self.task = task = TASKS[env_id]()
-        if task.formulas.choices or task.formulas.actions != 1:
-            raise Refused(f"{POLICY}: planning ahead is for tasks with one action, in a range")
+        if task.formulas.choices:
+            raise Refused(f"{POLICY}: planning ahead is for actions in a range")
         for key, entries in (("weights", table.weights), ("rest", table.rest)):
             for name in entries:
                 if name not in task.scene.state_names:
@@ -67,10 +66,9 @@ class PlanAhead(Architecture):
                 f"{POLICY}: renewing plans takes {steps:.0f} steps of the model per step of the environment, "
                 f"at most {protocol.MODEL_STEPS} are allowed; plan less far, or less often"
             )
-        self.numbers = table.model_dump(exclude={"architecture", "weights", "rest"}, exclude_none=True)
-        self.tail = away(task, table.weights, table.rest) if table.weights else None
+        self.numbers = table.model_dump(exclude={"architecture"}, exclude_none=True)
         self.arrays = {}
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:
         """Return a planner without a plan yet."""
-        return MPC(self.task, self.tail, **self.numbers)
+        return planner(self.task, **self.numbers)
