@@ -303,6 +303,8 @@ class ILQR:
             cross = np.einsum("nai,naj->nij", gain, h_ux)
             outer = np.einsum("nai,nbj,nab->nij", gain, gain, h_uu)
             value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
+            if self.count > 1:  # Asymmetric rounding grows along unstable plans. One action keeps its numbers.
+                value_xx = 0.5 * (value_xx + value_xx.transpose(0, 2, 1))
         return change, gains
 
 
@@ -342,11 +344,12 @@ def concave(matrices: Array) -> Array:
 
 
 def convex(matrices: Array, least: float) -> Array:
-    """Return symmetric matrices (..., m, m) with eigenvalues of at least a number."""
+    """Return symmetric matrices (..., m, m) with eigenvalues of at least a number, and never singular."""
     if matrices.shape[-1] == 1:
         return np.maximum(matrices, least)
     values, vectors = np.linalg.eigh(matrices)
-    return (vectors * np.maximum(values, least)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    values = np.maximum(values, np.maximum(least, 1e-9 * values[..., -1:]))
+    return (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
 
 
 def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: float) -> tuple[Array, Array]:
