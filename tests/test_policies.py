@@ -21,6 +21,7 @@ from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.leaderboard.verify import record_again, verify
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
+from lag_envs.tasks.arm import Reach
 from lag_envs.tasks.record import Goal
 
 BOARD = Board(Path(__file__).parents[1] / "leaderboard")
@@ -268,6 +269,18 @@ def test_one_who_plans_ahead_is_the_same_again(tmp_path):
     assert (returns[0] == returns[1]).all() and returns[0].mean() > 80.0  # of 100
 
 
+def test_one_who_plans_ahead_for_two_controls(tmp_path):
+    env = Reach.id
+    policy = AHEAD | {"horizon": 40, "every": 5, "iterations": 2, "budget": 20_000}
+    made = submission(tmp_path / "a", env, policy, arrays=None)
+    returns = [play(env, made.policies[0][1].agent(), range(3), duration=1.0) for _ in range(2)]
+    assert (returns[0] == returns[1]).all() and returns[0].mean() > 25.0  # of 50, and on the way for half of it
+    # A final cost draws the arm of another task level, without its reward's help.
+    weights = {"theta_1": 10.0, "theta_2": 10.0, "theta_1_dot": 1.0, "theta_2_dot": 1.0}
+    agent = architecture(RANGES, AHEAD | {"weights": weights}).agent({})
+    assert play(RANGES, agent, range(2)).mean() > 37.0  # of 40
+
+
 # --- hostile ------------------------------------------------------------------------------------------------
 
 
@@ -294,8 +307,8 @@ def test_one_who_plans_ahead_is_the_same_again(tmp_path):
         (LISTED, NET, "squash means nothing where actions are listed"),
         (LISTED, {"architecture": "mlp", "hidden": [], "bins": 3}, "bins means nothing where actions"),
         (LISTED, {"architecture": "plan"}, "plans are for actions in a range"),
-        (LISTED, AHEAD, "planning ahead is for tasks with one action, in a range"),
-        (RANGES, AHEAD, "planning ahead is for tasks with one action"),
+        (LISTED, AHEAD, "planning ahead is for actions in a range"),
+        (LISTS, AHEAD, "planning ahead is for actions in a range"),
         (incline.Tilt.id, AHEAD | {"horizon": 251}, "horizon: Input should be less"),
         (incline.Tilt.id, AHEAD | {"budget": 10**7}, "budget: Input should be less"),
         (incline.Tilt.id, AHEAD | {"weights": {"x": -1.0}}, "weights.x: Input should be greater"),

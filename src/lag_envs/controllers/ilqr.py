@@ -18,7 +18,7 @@ from lag_envs.tasks.base import Task
 #: Step sizes of the line search, tried in parallel.
 SHARES = 0.5 ** np.arange(0, 10, 1.5)
 #: Most sweeps in which the best actions within their bounds are found.
-SWEEPS = 8
+SWEEPS = 20
 #: Smallest trusted curvature over an action [reward/action²], in a step of the task's own interval.
 FLAT = 1e-4
 
@@ -355,8 +355,9 @@ def convex(matrices: Array, least: float) -> Array:
 def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: float) -> tuple[Array, Array]:
     """Return the best step d of actions within their bounds, and its feedback on the state.
 
-    The step maximises slope'd - d'bend d/2 by projected Newton. Each sweep solves for the actions that do not
-    press against a bound, and clips the best of several step sizes. Actions at a bound get no feedback.
+    The step maximises slope'd - d'bend d/2 by projected Newton. In each sweep, one action after the other takes
+    its best value, which tells those at a bound; a Newton step of the rest, up to the next bound, follows.
+    Actions at a bound get no feedback.
 
     Parameters
     ----------
@@ -378,17 +379,30 @@ def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: flo
         wanted = actions + slope / bend[:, 0]
         free = (np.abs(wanted) < largest)[..., None]
         return np.clip(wanted, -largest, largest) - actions, np.where(free, mixed / bend, 0.0)
-    rows, u = np.arange(len(actions)), actions
-    shares = np.append(SHARES, 0.0)[:, None]
+    u, own = actions.copy(), np.einsum("naa->na", bend)
+    going = np.ones((len(actions), 1), np.bool_)
     for _ in range(SWEEPS):
-        left = slope - np.einsum("nab,nb->na", bend, u - actions)
-        free = (np.abs(u) < largest) | (left * u < 0.0)
-        face = np.where(free[:, :, None] & free[:, None], bend, np.eye(actions.shape[1]))
+        tried = u.copy()
+        for a, column in enumerate(own.T):
+            left = slope[:, a] - np.einsum("nb,nb->n", bend[:, a], tried - actions)
+            tried[:, a] = np.clip(tried[:, a] + left / column, -largest, largest)
+        free, face = inside(tried, bend, largest)
+        left = slope - np.einsum("nab,nb->na", bend, tried - actions)
         newton = np.linalg.solve(face, np.where(free, left, 0.0)[..., None])[..., 0]
-        if (np.abs(newton) <= 1e-12 * largest).all():
+        room = np.where(newton < 0.0, -largest, largest) - tried
+        share = np.divide(room, newton, out=np.ones_like(newton), where=np.abs(newton) > np.abs(room))
+        tried = np.clip(tried + share.min(axis=1, keepdims=True) * newton, -largest, largest)
+        u = np.where(going, tried, u)
+        left = slope - np.einsum("nab,nb->na", bend, u - actions)
+        done = np.where(np.abs(u) < largest, np.abs(left) <= 1e-9 * largest * own, left * u >= 0.0)
+        going = ~done.all(axis=1, keepdims=True)
+        if not going.any():
             break
-        tried = np.clip(u[:, None] + shares * newton[:, None], -largest, largest)
-        d = tried - actions[:, None]
-        value = np.einsum("na,nka->nk", slope, d) - 0.5 * np.einsum("nka,nab,nkb->nk", d, bend, d)
-        u = tried[rows, value.argmax(axis=1)]
+    free, face = inside(u, bend, largest)
     return u - actions, np.linalg.solve(face, np.where(free[..., None], mixed, 0.0))
+
+
+def inside(actions: Array, bend: Array, largest: float) -> tuple[NDArray[np.bool_], Array]:
+    """Return which actions are within their bounds, and the curvature with that of the others replaced by 1."""
+    free = np.abs(actions) < largest
+    return free, np.where(free[:, :, None] & free[:, None], bend, np.eye(actions.shape[1]))
