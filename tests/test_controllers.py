@@ -313,9 +313,7 @@ def test_feedback_along_plans_of_several_actions():
     np.testing.assert_allclose(still[0], np.tile(still[1], (2, 1, 1)), rtol=1e-6)
     by_control = np.diag([1.0 / 5.0, 1.0 / 4.0])
     a, b = task.scene.jacobian(np.zeros(4), np.zeros(2), task.dt)
-    p = scipy.linalg.solve_discrete_are(
-        a, b, np.diag([1.0, 0.0, 2.0, 0.0]), 0.1 * by_control @ by_control
-    )
+    p = scipy.linalg.solve_discrete_are(a, b, np.diag([1.0, 0.0, 2.0, 0.0]), 0.1 * by_control @ by_control)
     gain = np.linalg.solve(0.1 * by_control @ by_control + b.T @ p @ b, b.T @ p @ a)
     np.testing.assert_allclose(still[1], by_control @ gain, rtol=1e-6)
     # A planner leaves holding to it.

@@ -274,7 +274,9 @@ def test_one_who_plans_ahead_for_two_controls(tmp_path):
     policy = AHEAD | {"horizon": 40, "every": 5, "iterations": 2, "budget": 20_000}
     made = submission(tmp_path / "a", env, policy, arrays=None)
     returns = [play(env, made.policies[0][1].agent(), range(3), duration=1.0) for _ in range(2)]
-    assert (returns[0] == returns[1]).all() and returns[0].mean() > 25.0  # of 50, and on the way for half of it
+    assert (returns[0] == returns[1]).all() and returns[
+        0
+    ].mean() > 25.0  # of 50, and on the way for half of it
     # A final cost draws the arm of another task level, without its reward's help.
     weights = {"theta_1": 10.0, "theta_2": 10.0, "theta_1_dot": 1.0, "theta_2_dot": 1.0}
     agent = architecture(RANGES, AHEAD | {"weights": weights}).agent({})

@@ -303,7 +303,9 @@ class ILQR:
             cross = np.einsum("nai,naj->nij", gain, h_ux)
             outer = np.einsum("nai,nbj,nab->nij", gain, gain, h_uu)
             value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
-            if self.count > 1:  # Asymmetric rounding grows along unstable plans. One action keeps its numbers.
+            if (
+                self.count > 1
+            ):  # Asymmetric rounding grows along unstable plans. One action keeps its numbers.
                 value_xx = 0.5 * (value_xx + value_xx.transpose(0, 2, 1))
         return change, gains
 
