@@ -43,7 +43,7 @@ class ILQR:
     Parameters
     ----------
     task : Task
-        The task with its parameters, ``env.unwrapped.task``; with continuous actions and without random kicks.
+        The task with its parameters, ``env.unwrapped.task``; with continuous actions, without random kicks.
     guesses : sequence of controllers
         Initial guesses; each is improved, and the best plan is played. `improve` alone needs none.
     after : controller, optional
@@ -179,7 +179,7 @@ class ILQR:
         return actions
 
     def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
-        """Return plans improved from actions (n, steps, n_actions), and their returns (n,), minus the final cost."""
+        """Return plans improved from actions (n, steps, n_actions), and their returns minus the final cost."""
         n = len(starts)
         plan = self._blank(n)
         states, actions, returns = self._play(
@@ -303,9 +303,9 @@ class ILQR:
             cross = np.einsum("nai,naj->nij", gain, h_ux)
             outer = np.einsum("nai,nbj,nab->nij", gain, gain, h_uu)
             value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
-            if (
-                self.count > 1
-            ):  # Asymmetric rounding grows along unstable plans. One action keeps its numbers.
+            # Asymmetry from rounding grows along unstable plans. With one action it stays: stored results that
+            # are recomputed would change.
+            if self.count > 1:
                 value_xx = 0.5 * (value_xx + value_xx.transpose(0, 2, 1))
         return change, gains
 
@@ -357,9 +357,9 @@ def convex(matrices: Array, least: float) -> Array:
 def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: float) -> tuple[Array, Array]:
     """Return the best step d of actions within their bounds, and its feedback on the state.
 
-    The step maximises slope'd - d'bend d/2 by projected Newton. In each sweep, one action after the other takes
-    its best value, which tells those at a bound; a Newton step of the rest, up to the next bound, follows.
-    Actions at a bound get no feedback.
+    The step maximises slope'd - d'bend d/2 by projected Newton. In each sweep, one action after the other
+    takes its best value, which tells those at a bound; a Newton step of the rest, up to the next bound,
+    follows. Actions at a bound get no feedback.
 
     Parameters
     ----------
@@ -401,10 +401,11 @@ def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: flo
         if not going.any():
             break
     free, face = inside(u, bend, largest)
-    return u - actions, np.linalg.solve(face, np.where(free[..., None], mixed, 0.0))
+    gains = np.asarray(np.linalg.solve(face, np.where(free[..., None], mixed, 0.0)), np.float64)
+    return u - actions, gains
 
 
 def inside(actions: Array, bend: Array, largest: float) -> tuple[NDArray[np.bool_], Array]:
-    """Return which actions are within their bounds, and the curvature with that of the others replaced by 1."""
+    """Return which actions are within their bounds, and the curvature, replaced by 1 for the others."""
     free = np.abs(actions) < largest
     return free, np.where(free[:, :, None] & free[:, None], bend, np.eye(actions.shape[1]))
