@@ -179,7 +179,7 @@ class ILQR:
         return actions
 
     def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
-        """Return plans improved from actions (n, steps, n_actions), and their returns minus the final cost."""
+        """Return plans improved from actions (n, steps, n_actions), and their returns less the final cost."""
         n = len(starts)
         plan = self._blank(n)
         states, actions, returns = self._play(
@@ -303,8 +303,8 @@ class ILQR:
             cross = np.einsum("nai,naj->nij", gain, h_ux)
             outer = np.einsum("nai,nbj,nab->nij", gain, gain, h_uu)
             value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
-            # Asymmetry from rounding grows along unstable plans. With one action it stays: stored results that
-            # are recomputed would change.
+            # Asymmetry from rounding grows along unstable plans. With one action it stays: removing it would
+            # change stored results.
             if self.count > 1:
                 value_xx = 0.5 * (value_xx + value_xx.transpose(0, 2, 1))
         return change, gains
