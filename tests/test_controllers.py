@@ -7,6 +7,8 @@ import gymnasium as gym
 import numpy as np
 import own_tasks
 import pytest
+import scipy.linalg
+import scipy.optimize
 from covering import covering, engine, quick, slow
 from rollouts import SINGLE
 
@@ -23,17 +25,20 @@ from lag_envs.controllers import (
     make_controller,
 )  # fmt: skip
 from lag_envs.controllers.basic import ObservationDecoder
-from lag_envs.controllers.linear import Regulator, time_varying
+from lag_envs.controllers.ilqr import within
+from lag_envs.controllers.linear import Regulator, regulator, time_varying
 from lag_envs.controllers.lookahead import LookAhead
-from lag_envs.controllers.mpc import MPC
+from lag_envs.controllers.mpc import MPC, planner, without_kicks
 from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergyShapingLQR
-from lag_envs.controllers.tracking import Tracking
+from lag_envs.controllers.tracking import Tracking, search, waves
 from lag_envs.envs.model import Model
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.evaluation.rollout import play
+from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.derivation import form_of
 from lag_envs.scores import known_returns, score
-from lag_envs.tasks import TASKS, cart_pole, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks import TASKS, Task, cart_pole, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks.record import Plans
 from lag_envs.tasks.registration import make_task
 
 SEED = 1_000_000_000
@@ -206,6 +211,122 @@ def test_linearisation_is_the_slope_of_the_model(env_id):
     np.testing.assert_allclose(slopes[:, n:], b @ per_action.T, rtol=1e-5, atol=1e-6)
 
 
+# --- several controls ---
+
+
+class Whirl(Task):
+    """Turn the upper arm fast, which takes all of the shoulder, and hardly the forearm."""
+
+    id = ""
+    scene = TwoLinkArm
+    defaults = {"gravity": 0.0}
+    interval, steps = 0.02, 8
+    action = {"shoulder": 5.0, "elbow": (-3.0, 5.0)}
+    start = {"theta_1": 0.5, "theta_2": 0.5}
+    plans = Plans(
+        f"{__name__}:unchanged", {}, steps=8, quick={}, batch=2, iterations=20, rest=(0.0, 0.0, 0.0, 0.0),
+        weights={"theta_1": 1.0, "theta_2": 2.0}, effort=0.1,
+    )  # fmt: skip
+
+    def observe(self, after, target, xp):
+        return {name: after[name] for name in self.scene.state_names}
+
+    def reward(self, before, after, control, target, dt, xp):
+        effort = 1e-3 * (control.shoulder**2 + control.elbow**2)
+        return -((after.theta_1_dot - 6.0) ** 2) - (after.theta_2_dot + 0.5) ** 2 - effort
+
+
+def unchanged(task):
+    """Return the task itself as an easier one, and a final cost."""
+    return task, lambda states: np.square(states[:, 2])
+
+
+def returns_of(planner, actions, starts, targets):
+    """Return the returns of actions (n, steps, n_actions)."""
+    x, total, alive = starts, np.zeros(len(starts)), np.ones(len(starts), np.bool_)
+    for t in range(planner.steps):
+        x, reward, ended = planner.advance(x, actions[:, t], targets)
+        total += np.where(alive, reward, 0.0)
+        alive &= ~ended
+    return total
+
+
+def test_plans_of_several_actions_beat_random_search():
+    planner, n = ILQR(without_kicks(own_tasks.Deliver()), [], steps=30), 3000
+    start, target = np.array([0.4, 1.2, 0.2, 0.0, 0.0, 0.0]), np.array([-0.4, -1.4])
+    tried = waves(np.random.default_rng(0), n, 30, planner.task.dt, 2)
+    assert tried.shape == (n, 30, 2) and not (tried[..., 0] == tried[..., 1]).any(axis=1).all()
+    found = returns_of(planner, tried, np.tile(start, (n, 1)), np.tile(target, (n, 1)))
+    plan, value = planner.improve(start[None], target[None], np.zeros((1, 30, 2)))
+    assert value[0] > found.max() + 0.5 > np.median(found) + 5.0
+    assert value == pytest.approx(returns_of(planner, plan.actions, start[None], target[None]))
+
+
+def test_one_action_at_its_bound_and_one_within():
+    planner, start = ILQR(Whirl(), [], steps=8, tolerance=1e-12), np.zeros((1, 4))
+    plan, value = planner.improve(start, np.zeros(1), np.zeros((1, 8, 2)))
+
+    def lost(actions):
+        return -returns_of(planner, actions.reshape(1, 8, 2), start, np.zeros(1))[0]
+
+    best = scipy.optimize.minimize(
+        lost, np.zeros(16), bounds=[(-1.0, 1.0)] * 16, options={"ftol": 1e-14, "gtol": 1e-8}
+    )
+    assert value[0] == pytest.approx(-best.fun, abs=2e-3)
+    np.testing.assert_allclose(plan.actions[0], best.x.reshape(8, 2), atol=2e-3)
+    shoulder, elbow = np.abs(plan.actions[0]).T
+    assert (shoulder[:6] == 1.0).all() and (elbow < 0.9).all()
+    assert not plan.gains[0, :6, 0].any() and plan.gains[0, :6, 1].any(axis=1).all()
+
+
+def test_steps_of_several_actions_within_their_bounds():
+    rng, n, m = np.random.default_rng(0), 200, 3
+    roots = rng.normal(size=(n, m, m)) + 0.3 * np.eye(m)
+    bend, slope = roots.transpose(0, 2, 1) @ roots, 2.0 * rng.normal(size=(n, m))
+    actions, mixed = np.clip(1.5 * rng.normal(size=(n, m)), -1.0, 1.0), rng.normal(size=(n, m, 2))
+    step, gains = within(actions, slope, bend, mixed, 1.0)
+    held = np.abs(actions + step) > 1.0 - 1e-9
+    assert {0, 1, 2, 3} == set(held.sum(axis=1))
+    for i in range(n):
+        wanted = np.linalg.solve(roots[i].T, slope[i])
+        bounds = -1.0 - actions[i], 1.0 - actions[i] + 1e-12
+        best = scipy.optimize.lsq_linear(roots[i], wanted, bounds, method="bvls", tol=1e-14)
+        np.testing.assert_allclose(step[i], best.x, atol=1e-6)
+        free = ~held[i]
+        expected = np.linalg.solve(bend[i][np.ix_(free, free)], mixed[i, free])
+        np.testing.assert_allclose(gains[i, free], expected, atol=1e-9)
+        assert not gains[i, held[i]].any()
+
+
+def test_feedback_along_plans_of_several_actions():
+    task = Whirl()
+    best = next(search(task))
+    assert best.actions.shape == (8, 2) and best.gains.shape == (8, 2, 4) and best.hold.shape == (2, 4)
+    model = Model(task)
+    x = best.states[:1]
+    for t in range(8):
+        np.testing.assert_allclose(x[0], best.states[t], atol=1e-9)
+        x = model(x, best.actions[t][None])[0]
+    # At rest it is the regulator's, whose controls are in newton metres.
+    still = time_varying(task, np.zeros((3, 4)), np.tile(task.rest_action, (2, 1)), [0.0] * 4,
+                         task.plans.weights, task.plans.effort)  # fmt: skip
+    np.testing.assert_allclose(still[0], np.tile(still[1], (2, 1, 1)), rtol=1e-6)
+    by_control = np.diag([1.0 / 5.0, 1.0 / 4.0])
+    a, b = task.scene.jacobian(np.zeros(4), np.zeros(2), task.dt)
+    p = scipy.linalg.solve_discrete_are(a, b, np.diag([1.0, 0.0, 2.0, 0.0]), 0.1 * by_control @ by_control)
+    gain = np.linalg.solve(0.1 * by_control @ by_control + b.T @ p @ b, b.T @ p @ a)
+    np.testing.assert_allclose(still[1], by_control @ gain, rtol=1e-6)
+    # A planner leaves holding to it.
+    agent = MPC(task, horizon=3, guesses=1, iterations=1, budget=30, hold=best, holds=lambda x: x[:, 0] > 0.1)
+    seen = np.array([[0.2, 0.0, 0.1, 0.0], [0.0, 0.0, 0.0, 0.0]], np.float32)
+    actions, plan = agent.predict(seen)
+    held = best.act(seen.astype(np.float64), None, np.full(2, np.inf))
+    np.testing.assert_allclose(actions[0], np.clip(held[0], -1.0, 1.0), rtol=1e-6)
+    assert actions.shape == (2, 2) and plan.actions.shape == (2, 3, 2) and actions[1, 0] == 1.0
+    alone, _ = agent.predict(seen[0])
+    assert alone.shape == (2,)
+
+
 # --- mistakes ---
 
 
@@ -249,11 +370,14 @@ def test_what_cannot_work_is_refused():
         make_controller(SHELL, "LQR").predict(np.zeros(3))
     with pytest.raises(ValueError, match="Balance has random kicks"):
         ILQR(make_task(BALANCE), [Constant(0.0)])
-    for planner in (ILQR, MPC):
-        with pytest.raises(ValueError, match=r"takes one control .*; Deliver has 2 controls"):
-            planner(own_tasks.Deliver(), [])
-    with pytest.raises(ValueError, match="CartPoleExact has listed actions"):
-        ILQR(cart_pole.CartPoleExact(), [])
+    with pytest.raises(ValueError, match=r"takes one control .*; Deliver has 2 controls"):
+        regulator(own_tasks.Deliver(), [0.0] * 6)
+    for kind in (ILQR, MPC):
+        with pytest.raises(ValueError, match="takes continuous actions; CartPoleExact has listed actions"):
+            kind(cart_pole.CartPoleExact(), [])
+    for names in ({"weights": {"thetta": 1.0}}, {"rest": {"thetta": 1.0}}):
+        with pytest.raises(ValueError, match=r"(weights|rest): there is no 'thetta'; did you mean theta"):
+            planner(make_task(BAR), **names)
     misspelt = {"thetta": 1.0}
     for found in ({"weights": {}, "at": misspelt}, {"weights": misspelt}):
         with pytest.raises(ValueError, match=r"(at|weights): there is no 'thetta'; did you mean theta"):

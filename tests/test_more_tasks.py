@@ -148,8 +148,12 @@ def test_easy_entries_are_no_gift():
 
 @pytest.mark.slow
 def test_the_arm_needs_more_than_springs():
-    found = {name: play(Reach.id, make_controller(Reach.id, name), range(100)) for name in Reach.controllers}
-    assert found["springs"].mean() + 50.0 < found["computed torque"].mean() < 190.0
+    springs, torque = (
+        play(Reach.id, make_controller(Reach.id, name), range(100)) for name in ("springs", "computed torque")
+    )
+    assert springs.mean() + 50.0 < torque.mean() < 190.0
+    planned = play(Reach.id, make_controller(Reach.id, "MPC"), range(8))
+    assert planned.mean() > torque[:8].mean() + 2.0
 
 
 def test_some_points_can_be_held_in_one_posture_only():

@@ -9,7 +9,7 @@ import pytest
 from own_tasks import Switched
 
 from lag_envs import register
-from lag_envs.controllers.basic import Choice
+from lag_envs.controllers.basic import Choice, Constant
 from lag_envs.controllers.tracking import Tracking
 from lag_envs.evaluation.conditions import often
 from lag_envs.evaluation.rollout import play
@@ -22,6 +22,7 @@ from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.leaderboard.verify import record_again, verify
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
+from lag_envs.tasks.arm import Reach
 from lag_envs.tasks.record import Goal
 
 BOARD = Board(Path(__file__).parents[1] / "leaderboard")
@@ -297,6 +298,18 @@ def test_one_who_plans_among_listed_actions_is_the_same_again(tmp_path, env):
     assert returns[0] == returns[1] > played_alone(env, Choice(TASKS[env]()), 40)
 
 
+def test_one_who_plans_ahead_for_two_controls(tmp_path):
+    env = Reach.id
+    policy = AHEAD | {"horizon": 40, "every": 5, "iterations": 2, "budget": 20_000}
+    made = submission(tmp_path / "a", env, policy, arrays=None)
+    returns = [play(env, made.policies[0][1].agent(), range(3), duration=1.0) for _ in range(2)]
+    assert (returns[0] == returns[1]).all() and returns[0].mean() > 25.0  # of 50
+    # A final cost for another arm.
+    agent = architecture(RANGES, AHEAD | {"weights": {"theta_1": 10.0, "theta_1_dot": 1.0}}).agent({})
+    idle = play(RANGES, Constant([0.0, 0.0]), range(2))
+    assert (play(RANGES, agent, range(2)) > idle + 10.0).all()
+
+
 # --- hostile ------------------------------------------------------------------------------------------------
 
 
@@ -330,7 +343,6 @@ def test_one_who_plans_among_listed_actions_is_the_same_again(tmp_path, env):
         (LISTED, BEAM | {"weights": {"x": 1.0}}, "weights must name entries of the state, s, "),
         (LISTED, BEAM | {"cell": 0.0}, "cell: Input should be greater"),
         (incline.Tilt.id, AHEAD | {"energy": 1.0}, "energy means nothing where actions lie in a range"),
-        (RANGES, AHEAD, "planning ahead is for tasks with one action"),
         (incline.Tilt.id, AHEAD | {"horizon": 251}, "horizon: Input should be less"),
         (incline.Tilt.id, AHEAD | {"budget": 10**7}, "budget: Input should be less"),
         (incline.Tilt.id, AHEAD | {"weights": {"x": -1.0}}, "weights.x: Input should be greater"),

@@ -261,6 +261,12 @@ def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:
             raise ValueError(f"{what}: there is no {name!r}; {hint(name, known)}")
 
 
+def check_continuous(what: str, task: Task) -> None:
+    """Raise a ValueError for a task whose actions are listed."""
+    if task.formulas.choices:
+        raise ValueError(f"{what} takes continuous actions; {type(task).__name__} has listed actions")
+
+
 def check_single_control(what: str, task: Task) -> None:
     """Raise a ValueError for a task that does not have one control with continuous actions."""
     if task.formulas.choices or task.formulas.actions != 1:

@@ -8,15 +8,17 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions, check_single_control
+from lag_envs.controllers.basic import Array, ObservationDecoder, check_continuous
 from lag_envs.envs.model import REACH, Model
 from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
 
 #: Step sizes of the line search, tried in parallel.
 SHARES = 0.5 ** np.arange(0, 10, 1.5)
+#: Most sweeps in which the best actions within their bounds are found.
+SWEEPS = 20
 #: Smallest trusted curvature over an action [reward/action²], in a step of the task's own interval.
 FLAT = 1e-4
 
@@ -26,8 +28,8 @@ class Plan(NamedTuple):
 
     step: NDArray[np.intp]  # (n,)
     states: Array  # (n, steps, n_state)
-    actions: Array  # (n, steps)
-    gains: Array  # (n, steps, n_state)
+    actions: Array  # (n, steps, n_actions)
+    gains: Array  # (n, steps, n_actions, n_state)
     memory: Any  # of the controller that continues after the plan
 
 
@@ -41,7 +43,7 @@ class ILQR:
     Parameters
     ----------
     task : Task
-        The task with its parameters, ``env.unwrapped.task``; with one control and without random kicks.
+        The task with its parameters, ``env.unwrapped.task``; with continuous actions, without random kicks.
     guesses : sequence of controllers
         Initial guesses; each is improved, and the best plan is played. `improve` alone needs none.
     after : controller, optional
@@ -72,7 +74,7 @@ class ILQR:
         iterations: int = 100,
         tolerance: float = 1e-3,
     ) -> None:
-        check_single_control("iLQR", task)
+        check_continuous("iLQR", task)
         if task.draws:
             raise ValueError(f"{type(task).__name__} has random kicks, which a plan does not foresee")
         self.task, self.guesses, self.tail = task, guesses, tail
@@ -80,7 +82,7 @@ class ILQR:
         self.steps = int(min(task.limit, 1000 if steps is None else steps))
         self.iterations, self.tolerance = iterations, tolerance
         self.flat = FLAT * task.dt / task.interval
-        self.largest = task.formulas.largest
+        self.largest, self.count = task.formulas.largest, task.formulas.actions
         self.model, self.read = Model(task), ObservationDecoder(task)
         self._k = SimpleNamespace(**task.formulas.constants())
 
@@ -109,22 +111,27 @@ class ILQR:
             plan.step[fresh] = 0
         rows, now = np.arange(n), np.minimum(plan.step, self.steps - 1)
         off = self.read.difference(x, plan.states[rows, now])  # a plan's angles may exceed ±π
-        action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
+        action = plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
         memory = plan.memory
         if (plan.step >= self.steps).any():
             beyond, memory = self.after.predict(values.reshape(n, -1), memory, plan.step <= self.steps)
-            action = np.where(plan.step >= self.steps, beyond[:, 0], action)
+            action = np.where((plan.step >= self.steps)[:, None], beyond, action)
         plan = plan._replace(step=plan.step + 1, memory=memory)
-        return as_actions(action.reshape(values.shape[:-1]), self.largest), plan
+        action = np.clip(action, -self.largest, self.largest).astype(np.float32)
+        return action.reshape(*values.shape[:-1], self.count), plan
 
     def _blank(self, n: int) -> Plan:
-        shape = n, self.steps, len(self.task.scene.state_names)
-        return Plan(np.zeros(n, np.intp), np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape), None)
+        many, width = (n, self.steps), len(self.task.scene.state_names)
+        acting = np.zeros((*many, self.count)), np.zeros((*many, self.count, width))
+        return Plan(np.zeros(n, np.intp), np.zeros((*many, width)), *acting, None)
 
     # --- planning ------------------------------------------------------------------------------------------
 
     def plan(self, starts: Array, targets: Array) -> tuple[Plan, Array]:
-        """Return the best plan for each start (n, n_state) and target (n,), and its return from `improve`."""
+        """Return the best plan for each start (n, n_state) and target, and its return from `improve`.
+
+        Targets have the shape (n,), whether there are any or not, or (n, n_targets) if there are several.
+        """
         best: Plan | None = None
         most = np.full(len(starts), -math.inf)
         for guess in self.guesses:
@@ -141,36 +148,42 @@ class ILQR:
         return best, most
 
     def advance(self, x: Array, actions: Array, targets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Step the model for arrays of any leading shape."""
-        shape = actions.shape
-        goals = self.goals_for(targets, shape)
-        z, reward, ended = self.model(x.reshape(-1, x.shape[-1]), actions.ravel(), goals)
+        """Step the model from states (..., n_state) with actions (..., n_actions)."""
+        shape = x.shape[:-1]
+        flat = x.reshape(-1, x.shape[-1]), self._flat(actions), self._goals(targets, shape)
+        z, reward, ended = self.model(*flat)
         return z.reshape(x.shape), reward.reshape(shape), ended.reshape(shape)
 
-    def goals_for(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
-        """Return the targets of as many steps, or None if the task has none."""
-        return None if self.task.target_range is None else np.broadcast_to(targets, shape).ravel()
+    def _flat(self, actions: Array) -> Array:
+        """Return actions (..., n_actions) as `Model` takes them."""
+        return actions.ravel() if self.count == 1 else actions.reshape(-1, self.count)
+
+    def _goals(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
+        """Return the targets of as many steps, as `Model` takes them; None if the task has none."""
+        if self.task.target_range is None:
+            return None
+        each = np.shape(self.task.target_range)
+        return np.broadcast_to(targets, (*shape, *each)).reshape(-1, *each)
 
     def _guess(self, guess: Any, starts: Array, targets: Array) -> Array:
-        """Return a controller's actions (n, steps)."""
-        x, memory, actions = starts, None, np.empty((len(starts), self.steps))
+        """Return a controller's actions (n, steps, n_actions)."""
+        x, memory, actions = starts, None, np.empty((len(starts), self.steps, self.count))
+        form, formulas = form_of(self.task.scene), self.task.formulas
+        goals = [*np.reshape(targets, (len(starts), -1)).T][: formulas.targets]
         for t in range(self.steps):
-            form, formulas = form_of(self.task.scene), self.task.formulas
             lifted = form.lift(x) if form else tuple(x.T)
-            seen = formulas.observe(np, lifted, [targets] * formulas.targets, self._k)
+            seen = formulas.observe(np, lifted, goals, self._k)
             observation = np.stack(np.broadcast_arrays(*seen), axis=-1)
-            action, memory = guess.predict(observation, memory)
-            actions[:, t] = action[:, 0]
+            actions[:, t], memory = guess.predict(observation, memory)
             x = self.advance(x, actions[:, t], targets)[0]
         return actions
 
     def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
-        """Return plans improved from actions (n, steps), and their returns (n,), minus the final cost."""
+        """Return plans improved from actions (n, steps, n_actions), and their returns less the final cost."""
         n = len(starts)
         plan = self._blank(n)
         states, actions, returns = self._play(
-            starts, targets, np.zeros((n, self.steps, starts.shape[1])), actions, plan.gains, plan.actions,
-            np.zeros(1),
+            starts, targets, plan.states, actions, plan.gains, plan.actions, np.zeros(1)
         )  # fmt: skip
         plan = plan._replace(states=states, actions=actions)
         damping = np.full(n, 10.0 * self.flat)
@@ -205,13 +218,12 @@ class ILQR:
         x = np.repeat(starts[:, None], lines, axis=1)
         goals = targets[:, None]
         xs = np.empty((n, lines, self.steps, x.shape[-1]))
-        us = np.empty((n, lines, self.steps))
+        us = np.empty((n, lines, self.steps, self.count))
         total, alive = np.zeros((n, lines)), np.ones((n, lines), np.bool_)
         for t in range(self.steps):
-            feedback = np.einsum("ij,ikj->ik", gains[:, t], x - states[:, None, t])
-            u = np.clip(
-                actions[:, t, None] + shares * change[:, t, None] + feedback, -self.largest, self.largest
-            )
+            feedback = np.einsum("iaj,ikj->ika", gains[:, t], x - states[:, None, t])
+            u = actions[:, t, None] + shares[:, None] * change[:, t, None] + feedback
+            u = np.clip(u, -self.largest, self.largest)
             xs[:, :, t], us[:, :, t] = x, u
             x, reward, ended = self.advance(x, u, goals)
             total += np.where(alive, reward, 0.0)
@@ -224,25 +236,26 @@ class ILQR:
     def _expand(self, states: Array, actions: Array, targets: Array) -> tuple[Array, ...]:
         """Return the model's slopes (n, T, m, n_state), the reward's (n, T, m) and curvature (n, T, m, m).
 
-        The m variables are the state's entries and the action. The last two results are the gradient (n,
+        The m variables are the state's entries and the actions. The last two results are the gradient (n,
         n_state) and the curvature (n, n_state, n_state) of the value at the plan's end.
         """
         n, steps, width = states.shape
-        m = width + 1
+        m = width + self.count
         slopes = np.empty((n, steps, m, width))
         gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
-        # The action is moved inward from its bounds, beyond which it has no effect.
+        # Actions are moved inward from their bounds, beyond which they have no effect.
         inner = np.clip(actions, REACH - self.largest, self.largest - REACH)
         size = max(1, 4_000 // steps)  # fits into the cache
         for first in range(0, n, size):
             part = slice(first, first + size)
-            x, u = states[part].reshape(-1, width), inner[part].ravel()
-            found = self.model.expand(x, u, self.goals_for(targets[part, None], actions[part].shape))
+            x, u = states[part].reshape(-1, width), self._flat(inner[part])
+            found = self.model.expand(x, u, self._goals(targets[part, None], states[part].shape[:-1]))
             slopes[part] = found.slopes.transpose(0, 2, 1).reshape(slopes[part].shape)
             gradient[part] = found.gradient.reshape(gradient[part].shape)
             curvature[part] = found.curvature.reshape(curvature[part].shape)
         # At a bound the reward is as steep as just inside, except for the curvature.
-        gradient[..., -1] += curvature[..., -1, -1] * (actions - inner)
+        bend = curvature[..., width:, width:]
+        gradient[..., width:] += np.einsum("...ab,...b->...a", bend, actions - inner)
         curvature = concave(curvature)
         if self.tail is None:
             return slopes, gradient, curvature, np.zeros((n, width)), np.zeros((n, width, width))
@@ -273,24 +286,27 @@ class ILQR:
         self, actions: Array, damping: Array, slopes: Array, gradient: Array, curvature: Array,
         value_x: Array, value_xx: Array,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Return the change of the actions (n, T) and the gains (n, T, n_state), by dynamic programming."""
+        """Return the change of the actions (n, T, n_actions) and the gains, by dynamic programming."""
         n, steps, _, width = slopes.shape
-        change, gains = np.empty((n, steps)), np.empty((n, steps, width))
+        change, gains = np.empty((n, steps, self.count)), np.empty((n, steps, self.count, width))
         for t in range(steps - 1, -1, -1):
             f = slopes[:, t]
             q = gradient[:, t] + np.einsum("nmi,ni->nm", f, value_x)
             h = curvature[:, t] + f @ value_xx @ f.transpose(0, 2, 1)
-            q_x, q_u, h_xx, h_ux, h_uu = q[:, :-1], q[:, -1], h[:, :-1, :-1], h[:, -1, :-1], h[:, -1, -1]
-            bend = np.maximum(-h_uu, self.flat) + damping
-            wanted = actions[:, t] + q_u / bend
-            step = np.clip(wanted, -self.largest, self.largest) - actions[:, t]
-            free = (np.abs(wanted) < self.largest)[:, None]
-            gain = np.where(free, h_ux / bend[:, None], 0.0)
+            q_x, q_u = q[:, :width], q[:, width:]
+            h_xx, h_ux, h_uu = h[:, :width, :width], h[:, width:, :width], h[:, width:, width:]
+            bend = convex(-h_uu, self.flat) + damping[:, None, None] * np.eye(self.count)
+            step, gain = within(actions[:, t], q_u, bend, h_ux, self.largest)
             change[:, t], gains[:, t] = step, gain
-            value_x = q_x + gain * (q_u + h_uu * step)[:, None] + h_ux * step[:, None]
-            cross = gain[:, :, None] * h_ux[:, None, :]
-            outer = gain[:, :, None] * gain[:, None, :] * h_uu[:, None, None]
+            slope = q_u + np.einsum("nab,nb->na", h_uu, step)
+            value_x = q_x + np.einsum("nai,na->ni", gain, slope) + np.einsum("nai,na->ni", h_ux, step)
+            cross = np.einsum("nai,naj->nij", gain, h_ux)
+            outer = np.einsum("nai,nbj,nab->nij", gain, gain, h_uu)
             value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
+            # Asymmetry from rounding grows along unstable plans. With one action it stays: removing it would
+            # change stored results.
+            if self.count > 1:
+                value_xx = 0.5 * (value_xx + value_xx.transpose(0, 2, 1))
         return change, gains
 
 
@@ -299,7 +315,7 @@ class Opening:
 
     Parameters
     ----------
-    action : float
+    action : float or sequence of float
         The action to begin with.
     steps : int
         Number of steps for which it is kept.
@@ -307,8 +323,8 @@ class Opening:
         The controller that takes over.
     """
 
-    def __init__(self, action: float, steps: int, then: Any) -> None:
-        self.action, self.steps, self.then = action, steps, then
+    def __init__(self, action: ArrayLike, steps: int, then: Any) -> None:
+        self.action, self.steps, self.then = np.asarray(action, np.float32), steps, then
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -320,10 +336,76 @@ class Opening:
             step = np.where(np.reshape(episode_start, shape), 0, step)
         actions, memory = self.then.predict(observation, memory, episode_start, deterministic)
         opening = (step < self.steps)[..., None]
-        return np.where(opening, np.float32(self.action), actions), (step + 1, memory)
+        return np.where(opening, self.action, actions), (step + 1, memory)
 
 
 def concave(matrices: Array) -> Array:
     """Return symmetric matrices (..., m, m) without their positive curvature."""
     values, vectors = np.linalg.eigh(matrices)
     return (vectors * np.minimum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+
+
+def convex(matrices: Array, least: float) -> Array:
+    """Return symmetric matrices (..., m, m) with eigenvalues of at least a number, and never singular."""
+    if matrices.shape[-1] == 1:
+        return np.maximum(matrices, least)
+    values, vectors = np.linalg.eigh(matrices)
+    values = np.maximum(values, np.maximum(least, 1e-9 * values[..., -1:]))
+    return (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+
+
+def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: float) -> tuple[Array, Array]:
+    """Return the best step d of actions within their bounds, and its feedback on the state.
+
+    The step maximises slope'd - d'bend d/2 by projected Newton. In each sweep, one action after the other
+    takes its best value, which tells those at a bound; a Newton step of the rest, up to the next bound,
+    follows. Actions at a bound get no feedback.
+
+    Parameters
+    ----------
+    actions, slope : ndarray, shape (n, m)
+        The actions, and the slope of the value.
+    bend : ndarray, shape (n, m, m)
+        The value's negative curvature, positive definite.
+    mixed : ndarray, shape (n, m, n_state)
+        Its second derivatives by action and state.
+    largest : float
+        The largest action.
+
+    Returns
+    -------
+    step : ndarray, shape (n, m)
+    gains : ndarray, shape (n, m, n_state)
+    """
+    if actions.shape[1] == 1:  # closed form
+        wanted = actions + slope / bend[:, 0]
+        free = (np.abs(wanted) < largest)[..., None]
+        return np.clip(wanted, -largest, largest) - actions, np.where(free, mixed / bend, 0.0)
+    u, own = actions.copy(), np.einsum("naa->na", bend)
+    going = np.ones((len(actions), 1), np.bool_)
+    for _ in range(SWEEPS):
+        tried = u.copy()
+        for a, column in enumerate(own.T):
+            left = slope[:, a] - np.einsum("nb,nb->n", bend[:, a], tried - actions)
+            tried[:, a] = np.clip(tried[:, a] + left / column, -largest, largest)
+        free, face = inside(tried, bend, largest)
+        left = slope - np.einsum("nab,nb->na", bend, tried - actions)
+        newton = np.linalg.solve(face, np.where(free, left, 0.0)[..., None])[..., 0]
+        room = np.where(newton < 0.0, -largest, largest) - tried
+        share = np.divide(room, newton, out=np.ones_like(newton), where=np.abs(newton) > np.abs(room))
+        tried = np.clip(tried + share.min(axis=1, keepdims=True) * newton, -largest, largest)
+        u = np.where(going, tried, u)
+        left = slope - np.einsum("nab,nb->na", bend, u - actions)
+        done = np.where(np.abs(u) < largest, np.abs(left) <= 1e-9 * largest * own, left * u >= 0.0)
+        going = ~done.all(axis=1, keepdims=True)
+        if not going.any():
+            break
+    free, face = inside(u, bend, largest)
+    gains = np.asarray(np.linalg.solve(face, np.where(free[..., None], mixed, 0.0)), np.float64)
+    return u - actions, gains
+
+
+def inside(actions: Array, bend: Array, largest: float) -> tuple[NDArray[np.bool_], Array]:
+    """Return which actions are within their bounds, and the curvature, replaced by 1 for the others."""
+    free = np.abs(actions) < largest
+    return free, np.where(free[:, :, None] & free[:, None], bend, np.eye(actions.shape[1]))

@@ -17,6 +17,7 @@ from scipy.linalg import solve_discrete_are
 from lag_envs.controllers.basic import (
     FeedbackController,
     FeedbackLaw,
+    check_continuous,
     check_names,
     check_single_control,
     hold_law,
@@ -102,10 +103,10 @@ def time_varying(
     Parameters
     ----------
     task : Task
-        The task, with one control.
+        The task, with continuous actions.
     states : ndarray, shape (steps + 1, n_state)
         The plan's states.
-    actions : ndarray, shape (steps,)
+    actions : ndarray, shape (steps,), or (steps, n_actions) where there are several
         Its actions.
     rest : sequence of float, shape (n_state,)
         The equilibrium at its end.
@@ -116,35 +117,33 @@ def time_varying(
 
     Returns
     -------
-    gains : ndarray, shape (steps, n_state)
+    gains : ndarray, shape (steps, n_state) or (steps, n_actions, n_state)
         K_t of δa = -K_t δx.
-    hold : ndarray, shape (n_state,)
+    hold : ndarray, shape (n_state,) or (n_actions, n_state)
         The same at rest.
     """
-    check_single_control("time_varying", task)
-    scene = task.scene
+    check_continuous("time_varying", task)
+    scene, m = task.scene, task.formulas.actions
     check_names("weights", weights, scene.state_names)
-    q, r = np.diag([weights.get(name, 0.0) for name in scene.state_names]), np.array([[effort]])
-    unit = task.wanted([1.0]) - task.wanted([0.0])
-    column = int(np.flatnonzero(unit[0])[0])
-    a, b = scene.jacobian(rest, task.wanted([task.formulas.action(0.0)])[0], task.dt)
-    b = b[:, column : column + 1] * unit[0, column]
+    q, r = np.diag([weights.get(name, 0.0) for name in scene.state_names]), effort * np.eye(m)
+    by_action = (task.wanted(np.eye(m)) - task.wanted(np.zeros((m, m)))).T
+    a, b = scene.jacobian(rest, task.wanted(np.atleast_2d(task.rest_action))[0], task.dt)
+    b = b @ by_action
     p = solve_discrete_are(a, b, q, r)
 
     def gain(a: Array, b: Array, p: Array) -> Array:
         return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), np.float64)
 
-    hold = gain(a, b, p)[0]
-    gains = np.empty((len(actions), len(rest)))
-    if not len(actions):
-        return gains, hold
-    along, by = scene.jacobian(states[:-1], task.wanted(actions), task.dt)
+    hold = gain(a, b, p)
+    gains = np.empty((len(actions), m, len(rest)))
+    if len(actions):
+        along, by = scene.jacobian(states[:-1], task.wanted(actions), task.dt)
     for t in range(len(actions) - 1, -1, -1):
-        a, b = along[t], by[t][:, column : column + 1] * unit[0, column]
-        k = gain(a, b, p)
-        gains[t], closed = k[0], a - b @ k
+        a, b = along[t], by[t] @ by_action
+        gains[t] = k = gain(a, b, p)
+        closed = a - b @ k
         p = q + k.T @ r @ k + closed.T @ p @ closed
-    return gains, hold
+    return (gains[:, 0], hold[0]) if m == 1 else (gains, hold)
 
 
 class Regulator(FeedbackController):

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
+from lag_envs.controllers.basic import Array, ObservationDecoder, check_names
 from lag_envs.controllers.ilqr import ILQR, SHARES
+from lag_envs.controllers.swing_up import away
 from lag_envs.controllers.tracking import waves
-from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
 
 Tail = Callable[[Array], Array]
@@ -23,8 +23,8 @@ class Ahead(NamedTuple):
     step: NDArray[np.intp]  # (n,)
     wait: NDArray[np.intp]  # (n,), steps until the next search is allowed
     states: Array  # (n, horizon, n_state)
-    actions: Array  # (n, horizon)
-    gains: Array  # (n, horizon, n_state)
+    actions: Array  # (n, horizon, n_actions)
+    gains: Array  # (n, horizon, n_actions, n_state)
 
 
 class MPC:
@@ -37,7 +37,7 @@ class MPC:
     Parameters
     ----------
     task : Task
-        The task to control, with one control.
+        The task to control, with continuous actions.
     tail : callable, optional
         Final cost of a plan, from states (n, n_state) to numbers (n,).
     horizon : int
@@ -95,17 +95,16 @@ class MPC:
         self.task, self.horizon, self.every = task, horizon, min(every, horizon)
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
-        self.largest = task.formulas.largest
+        self.largest, self.count = task.formulas.largest, task.formulas.actions
         self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
         calm = without_kicks(task)
-        self.model = Model(calm)
         self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations)
-        self.idle = task.rest_action + 0.0  # no -0.0
+        self.idle = np.atleast_1d(task.rest_action) + 0.0  # no -0.0
         self.polisher = ILQR(calm, [], tail=tail, steps=horizon, iterations=5 * iterations)
         searched, end = easier or (calm, tail)
         rounds = max(budget // (guesses * horizon * len(SHARES)), 1)
         self.searcher = ILQR(searched, [], tail=end, steps=horizon, iterations=rounds, tolerance=1e-2)
-        self.share = float(searched.limit_control / task.limit_control)
+        self.share = np.asarray(searched.limit_control / task.limit_control)
 
     def predict(
         self,
@@ -122,9 +121,9 @@ class MPC:
         if episode_start is not None:
             fresh |= np.asarray(episode_start, np.bool_).reshape(n)
         if state is None:
-            shape = n, self.horizon, width
-            blank = np.zeros(n, np.intp)
-            state = Ahead(blank, blank, np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape))
+            many, blank = (n, self.horizon), np.zeros(n, np.intp)
+            acting = np.zeros((*many, self.count)), np.zeros((*many, self.count, width))
+            state = Ahead(blank, blank, np.zeros((*many, width)), *acting)
         plan = state._replace(**{name: getattr(state, name).copy() for name in state._fields})
         plan.wait[:] = np.where(fresh, 0, np.maximum(plan.wait - 1, 0))
         plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = self.idle, 0.0, x[fresh, None]
@@ -136,11 +135,12 @@ class MPC:
             self._renew(plan, np.flatnonzero(renewed), x, targets, fresh)
         now = np.minimum(plan.step, self.horizon - 1)
         off = self.read.difference(x, plan.states[rows, now])
-        action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
+        action = plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
         if held.any():
-            action = np.where(held, self.hold.act(x, targets, np.full(n, np.inf)), action)
+            action = np.where(held[:, None], self._holding(x, targets), action)
         plan.step[:] = np.where(held, self.horizon, plan.step + 1)
-        return as_actions(action.reshape(values.shape[:-1]), self.largest), plan
+        action = np.clip(action, -self.largest, self.largest).astype(np.float32)
+        return action.reshape(*values.shape[:-1], self.count), plan
 
     def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
         """Plan again for some of the episodes."""
@@ -161,17 +161,22 @@ class MPC:
         plan.step[rows] = 0
 
     def _continued(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array) -> Array:
-        """Return the actions (n, horizon) from following plans to their ends and holding there."""
-        actions = np.zeros((len(rows), self.horizon))
+        """Return the actions (n, horizon, n_actions) from following plans to their ends and holding there."""
+        actions = np.zeros((len(rows), self.horizon, self.count))
         for t in range(self.horizon):
             step = plan.step[rows] + t
             now = np.minimum(step, self.horizon - 1)
             off = self.read.difference(x, plan.states[rows, now])
-            action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
-            after = self.idle if self.hold is None else self.hold.act(x, targets, np.full(len(x), np.inf))
-            actions[:, t] = np.where(step < self.horizon, action, after).clip(-self.largest, self.largest)
-            x, _, _ = self.model(x, actions[:, t], self.planner.goals_for(targets, (len(x),)))
+            action = plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
+            after = self.idle if self.hold is None else self._holding(x, targets)
+            action = np.where((step < self.horizon)[:, None], action, after)
+            actions[:, t] = action.clip(-self.largest, self.largest)
+            x, _, _ = self.planner.advance(x, actions[:, t], targets)
         return actions
+
+    def _holding(self, x: Array, targets: Array) -> Array:
+        """Return the actions (n, n_actions) of the feedback at rest."""
+        return np.reshape(self.hold.act(x, targets, np.full(len(x), np.inf)), (len(x), self.count))
 
     def _ends_badly(self, states: Array, actions: Array, targets: Array) -> NDArray[np.bool_]:
         """Return which plans end badly."""
@@ -182,10 +187,41 @@ class MPC:
     def _search(self, x: Array, targets: Array) -> tuple[Any, Array]:
         """Return the best of plans from random guesses, and its value."""
         n, m = len(x), self.guesses
-        guesses = self.largest * waves(self.rng, n * m, self.horizon, self.task.dt)
-        found, values = self.searcher.improve(np.repeat(x, m, axis=0), np.repeat(targets, m), guesses)
+        guesses = self.largest * waves(self.rng, n * m, self.horizon, self.task.dt, self.count)
+        found, values = self.searcher.improve(np.repeat(x, m, axis=0), np.repeat(targets, m, axis=0), guesses)
         best = values.reshape(n, m).argmax(axis=1) + m * np.arange(n)
         return self.polisher.improve(x, targets, self.share * found.actions[best])
+
+
+def planner(
+    task: Task,
+    *,
+    weights: Mapping[str, float] | None = None,
+    rest: Mapping[str, float] | None = None,
+    **numbers: Any,
+) -> MPC:
+    """Return an MPC whose final cost is the distance from a rest; without weights there is none.
+
+    Parameters
+    ----------
+    task : Task
+        The task to control, with continuous actions.
+    weights : mapping, optional
+        Final cost of the squared distance from rest, by entry of the state; for angles of twice 1 minus its
+        cosine.
+    rest : mapping, optional
+        Nonzero entries of the state at rest.
+    **numbers
+        Other arguments of `MPC`.
+
+    Raises
+    ------
+    ValueError
+        For names that are no entries of the state, and a task with listed actions.
+    """
+    for what, given in (("weights", weights), ("rest", rest)):
+        check_names(what, given or {}, task.scene.state_names)
+    return MPC(task, away(task, weights, rest or {}) if weights else None, **numbers)
 
 
 def without_kicks(task: Task) -> Task:

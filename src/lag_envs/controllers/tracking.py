@@ -150,17 +150,17 @@ def hold(task: Task) -> Tracking:
 
 
 def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
-    """Return the controller that follows states (steps + 1, n_state) and actions (steps,)."""
+    """Return the controller that follows states (steps + 1, n_state) and actions, shaped as `Tracking`'s."""
     states, actions = np.asarray(states, np.float64), np.asarray(actions, np.float64)
     model = remade(task, **plans.smooth) if plans.smooth else task
     gains, last = time_varying(model, states, actions, plans.rest, plans.weights, plans.effort)
     return Tracking(task, states=states, actions=actions, gains=gains, rest=plans.rest, hold=last)
 
 
-def waves(rng: np.random.Generator, n: int, steps: int, dt: float) -> Array:
-    """Return random actions (n, steps): sums of three sines of 0.5 to 3 Hz, clipped."""
-    size, phase = rng.uniform(0.0, 1.0, (3, n, 1)), rng.uniform(0.0, 2.0 * np.pi, (3, n, 1))
-    turn = 2.0 * np.pi * rng.uniform(0.5, 3.0, (3, n, 1)) * dt * np.arange(steps)
+def waves(rng: np.random.Generator, n: int, steps: int, dt: float, count: int = 1) -> Array:
+    """Return random actions (n, steps, count): sums of three sines of 0.5 to 3 Hz, clipped."""
+    size, phase = rng.uniform(0.0, 1.0, (3, n, 1, count)), rng.uniform(0.0, 2.0 * np.pi, (3, n, 1, count))
+    turn = 2.0 * np.pi * rng.uniform(0.5, 3.0, (3, n, 1, count)) * dt * np.arange(steps)[:, None]
     return np.clip(np.sum(size * np.sin(turn + phase), axis=0), -1.0, 1.0)
 
 
@@ -182,13 +182,14 @@ def search(task: Task, seed: int = 0, **changes: Any) -> Iterator[Tracking]:
     size = {name: changes.pop(name, getattr(plans, name)) for name in ("steps", "batch", "iterations")}
     easier, tail = resolve(plans.place)(task, **(dict(plans.numbers) | changes))
     planner = ILQR(easier, [], tail=tail, steps=size["steps"], iterations=size["iterations"])
-    guesses = waves(np.random.default_rng(seed), size["batch"], size["steps"], easier.dt)
-    guesses *= easier.formulas.largest
+    count, rng = easier.formulas.actions, np.random.default_rng(seed)
+    guesses = easier.formulas.largest * waves(rng, size["batch"], size["steps"], easier.dt, count)
     every = round(easier.dt / task.dt)
     starts = np.tile(np.asarray(task.centre, np.float64), (len(guesses), 1))
     found, values = planner.improve(starts, np.zeros(len(guesses)), guesses)
     shares: Any = easier.limit_control / task.limit_control
     for i in np.argsort(-values):
-        actions = np.repeat(found.actions[i], every)
-        states = task.scene.simulate(starts[i], easier.wanted(actions)[:, 0], task.dt)
-        yield follow(task, states, shares * actions, plans)
+        actions = np.repeat(found.actions[i], every, axis=0)
+        states = task.scene.simulate(starts[i], easier.wanted(actions), task.dt)
+        actions = shares * actions
+        yield follow(task, states, actions[:, 0] if count == 1 else actions, plans)

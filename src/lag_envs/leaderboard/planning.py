@@ -10,8 +10,7 @@ from pydantic import Field
 
 from lag_envs.controllers.beam import beam
 from lag_envs.controllers.ilqr import SHARES
-from lag_envs.controllers.mpc import MPC
-from lag_envs.controllers.swing_up import away
+from lag_envs.controllers.mpc import planner
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
 from lag_envs.leaderboard.fields import between
@@ -42,7 +41,7 @@ class MPCTable(PolicyTable):
 
 
 class PlanAhead(Architecture):
-    """Model-predictive control: `lag_envs.controllers.mpc.MPC` with the table's numbers.
+    """Model-predictive control: `lag_envs.controllers.mpc.planner` with the table's numbers.
 
     In the table: `horizon` (steps); `every` (steps between new plans); `iterations` (of iLQR for each);
     `guesses` and `budget` (plans that a search improves, and its limit of model steps); `pause` (steps
@@ -63,8 +62,6 @@ class PlanAhead(Architecture):
     def __init__(self, env_id: str, table: MPCTable) -> None:
         self.task = task = TASKS[env_id]()
         listed = bool(task.formulas.choices)
-        if not listed and task.formulas.actions != 1:
-            raise Refused(f"{POLICY}: planning ahead is for tasks with one action, or with listed ones")
         for key in sorted((RANGED if listed else LISTED) & table.model_fields_set):
             where = "are listed" if listed else "lie in a range"
             raise Refused(f"{POLICY}: {key} means nothing where actions {where}; leave it out")
@@ -88,9 +85,7 @@ class PlanAhead(Architecture):
                 f"at most {protocol.MODEL_STEPS} are allowed; plan less far, or less often"
             )
         if not listed:
-            left_out = {"architecture", "weights", "rest", *LISTED}
-            self.numbers = table.model_dump(exclude=left_out, exclude_none=True)
-            self.numbers["tail"] = away(task, table.weights, table.rest) if table.weights else None
+            self.numbers = table.model_dump(exclude={"architecture", *LISTED}, exclude_none=True)
 
     def _beam(self, table: MPCTable) -> None:
         """Set the numbers of a beam search: its width, and what else the table states."""
@@ -107,4 +102,4 @@ class PlanAhead(Architecture):
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:
         """Return a planner without a plan yet."""
-        return (beam if self.task.formulas.choices else MPC)(self.task, **self.numbers)
+        return (beam if self.task.formulas.choices else planner)(self.task, **self.numbers)

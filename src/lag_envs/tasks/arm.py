@@ -91,6 +91,11 @@ class Reach(Task):
             "lag_envs.controllers.arm:ComputedTorque",
             tune={"frequency": (2.0, 40.0), "damping": (0.3, 2.0)},
         ),
+        "MPC": Controller(
+            "lag_envs.controllers.mpc:planner",
+            {"horizon": 50, "every": 5, "iterations": 3, "guesses": 32},
+            plans=True,
+        ),
     }
     reference = "computed torque"
     hyperparameters = {

@@ -267,8 +267,16 @@ class CartPoleContinuous(_OnTrack):
             "lag_envs.controllers.linear:Regulator",
             {"weights": {"x": 0.03, "x_dot": 0.03, "theta": 10.0, "theta_dot": 0.21}, "effort": 5e-4},
             tune={"effort": (1e-4, 1.0)},
-        )
-    }
+        ),
+        "MPC": Controller(
+            "lag_envs.controllers.mpc:planner",
+            {
+                "horizon": 50, "every": 2, "guesses": 4, "budget": 5_000,
+                "weights": {"x": 3.0, "x_dot": 10.0, "theta": 100.0, "theta_dot": 10.0},
+            },
+            plans=True,
+        ),
+    }  # fmt: skip
     reference = "LQR"
     hyperparameters = {
         "ppo": {"gamma": 0.98},
@@ -403,6 +411,18 @@ class CartPoleSwingUp(_OnTrack):
                 "effort": 0.013,
             },
             tune={"pump": (1.0, 60.0), "centring": (0.2, 20.0), "catch": (1.0, 60.0), "lose": (10.0, 300.0)},
+        ),
+        "MPC": Controller(
+            "lag_envs.controllers.mpc:planner",
+            {
+                "horizon": 80,
+                "every": 10,
+                "iterations": 3,
+                "weights": {"x": 3.0, "x_dot": 0.3, "theta": 10.0, "theta_dot": 0.1},
+                "good": 2.0,
+                "pause": 20,
+            },
+            plans=True,
         ),
     }
     plans = Plans(

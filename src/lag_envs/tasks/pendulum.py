@@ -128,6 +128,11 @@ class PendulumExact(_Rod):
 
     controllers = {
         "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
+        "MPC": Controller(
+            "lag_envs.controllers.mpc:planner",
+            {"horizon": 40, "iterations": 3, "guesses": 32},
+            plans=True,
+        ),
     }
     reference = "energy shaping + LQR"
     value_iteration = ValueIteration(
@@ -265,6 +270,11 @@ class PendulumRegret(_Rod):
     controllers = {
         "optimal law": Controller("lag_envs.controllers.pendulum:OwnLaw"),
         "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
+        "MPC": Controller(
+            "lag_envs.controllers.mpc:planner",
+            {"horizon": 60, "every": 2, "guesses": 32, "weights": {"theta": 5.0, "theta_dot": 0.5}},
+            plans=True,
+        ),
     }
     reference = "energy shaping + LQR"
     hyperparameters = {

@@ -89,7 +89,16 @@ class RotarySwingUp(Task):
                 "weights": {"phi": 0.0235, "phi_dot": 7e-4, "theta": 1.0, "theta_dot": 6e-4}, "effort": 0.08,
             },
             tune={"pump": (10.0, 1e3), "centring": (0.5, 50.0), "catch": (1.0, 60.0), "lose": (10.0, 1e3)},
-        )
+        ),
+        "MPC": Controller(
+            "lag_envs.controllers.mpc:planner",
+            {
+                "horizon": 70, "every": 10, "iterations": 3, "good": 3.0, "pause": 20,
+                "weights": {"phi": 3.0, "phi_dot": 0.1, "theta": 10.0, "theta_dot": 0.1},
+                "rest": {"theta": math.pi},
+            },
+            plans=True,
+        ),
     }  # fmt: skip
     plans = Plans(
         "lag_envs.controllers.swing_up:easier",
