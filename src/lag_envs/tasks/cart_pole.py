@@ -443,7 +443,7 @@ class CartPoleSwingUp(_OnTrack):
     hyperparameters = {
         "ppo": {"gamma": 0.99},
         "fast_ppo": {
-            "n_timesteps": 5e6,
+            "n_timesteps": 1e6,
             "n_epochs": 5,
             "reward_scale": 1.0,
             "episode_share": 1.0,
