@@ -121,7 +121,7 @@ def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
     module = OWN[algo][0].removeprefix("agents.") if algo in OWN else "learners"
     made, off, count = export(
         find([runs]), folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
-        description=f"{origin}, hyperparameters as `lag-envs hyperparams` prints them",
+        description=f"{origin}, with the hyperparameters that `lag-envs hyperparams` prints",
         code=f"{CODE}{module}.py",
     )  # fmt: skip
     if count:
@@ -136,6 +136,7 @@ def controller(env_id: str, name: str, folder: Path) -> Submission:
     return write(
         folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
         policy={"architecture": "controller", "name": name},
+        description="built in, with its own numbers",
     )  # fmt: skip
 
 

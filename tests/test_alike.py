@@ -1,5 +1,6 @@
 """Policies that act alike, however they are disguised, and those that do not."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -241,6 +242,18 @@ def test_returns_count_too(tmp_path):
     found = likeness(other, first, 1e-6)
     assert found.actions > alike.ACTIONS and found.closeness > 1.0
     assert likeness(other, first, 1e6).closeness < 1.0
+
+
+def test_equal_returns_tell_nothing_where_all_are_equal(monkeypatch, tmp_path):
+    """As those of two policies that both hold a pole for the whole episode, each in its own way."""
+    first = linear(tmp_path / "first")
+    other = linear(tmp_path / "other", arrays={0: LINEAR | {"offset": np.full(1, 0.02)}})
+    same = linear(tmp_path / "same", arrays={0: LINEAR | {"offset": np.full(1, 1e-6)}})
+    plain = alike.track
+    monkeypatch.setattr(alike, "track", lambda *given: replace(plain(*given), returns=np.full(16, 500.0)))
+    likeness = Likeness(first.env, "n")
+    assert likeness(other, first, 1e6).closeness > 1.0
+    assert likeness(same, first, 1e6).closeness < 1.0
 
 
 def test_a_policy_that_fails_acts_like_no_other(tmp_path):

@@ -3,7 +3,8 @@
 Both play the same episodes, which follow from the nonce. Each is also asked what it would do at the states on
 the other's path. Two policies are alike if their clipped actions at the states on both paths differ by less
 than `ACTIONS` (root mean square), or if their episodes' returns differ by less than `RETURNS` standard errors
-of a mean return (root mean square).
+of a mean return (root mean square). Where all episodes of both pay the same, as with two perfect policies,
+returns tell nothing, and only actions count.
 
 Noise of 1e-4 on all numbers of our networks moves their actions by up to 4e-3; the closest two of our
 separately trained policies are 1.4e-2 apart.
@@ -128,6 +129,8 @@ def distance(a: PlayedPolicy, b: PlayedPolicy, error: float) -> Distance:
     """
     off = float(np.sqrt(np.mean((a.returns - b.returns) ** 2)))
     returns = min(off / error, FAR.returns) if error > 0.0 else FAR.returns * (off > 0.0)
+    if np.ptp([a.returns, b.returns]) == 0.0:
+        returns = FAR.returns
     # First the one that can be asked at all states at once: the other may be slow.
     first, second = (a, b) if b.quick else (b, a)
     actions = 0.5 * first.asked(second)

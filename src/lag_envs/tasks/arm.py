@@ -122,8 +122,8 @@ class Reach(Task):
     note = (
         "Springs that pull towards the joint angles of the posture sag below them, because gravity pulls "
         "too. The computed torque compensates gravity and the links' coupling, and picks the posture that "
-        "costs less to hold. Among the learners the PPO in one file is best, followed by TQC, then by SAC "
-        "and TD3."
+        "costs less to hold. MPC plans on the exact model, and gets more in nearly every episode. Among the "
+        "learners the PPO in one file is best, followed by TQC, then by SAC and TD3."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

@@ -595,7 +595,8 @@ class Balance(_ChainTask):
         "td3": {"policy_kwargs": {"noise": 0.15}},
     }  # fmt: skip
     note = """
-The LQR is tuned for small deviations; feedback with directly optimised gains survives larger kicks.
+The PPO in one file is best, after many more steps than the other learners take. The LQR is tuned for small
+deviations; feedback with directly optimised gains survives larger kicks.
 """
 
     def check(self) -> None:

@@ -372,9 +372,10 @@ class Pump(_Shell):
     )
     note = """
 The greedy policy of value iteration is best. Doing nothing is a local optimum: every action costs effort
-before it pays. The PPO in one file has not escaped it; the other learners have. TD3 reaches the target energy
-as soon as the energy pump does, and then spends more effort on keeping it. PPO gets there later, except for
-one seed, and keeps the energy with less effort than TD3. TQC and SAC are not quite as good as these two.
+before it pays. The PPO in one file escapes it with enough steps, and is then as good as the energy pump. TD3
+reaches the target energy as soon as the energy pump does, and then spends more effort on keeping it. PPO gets
+there later, except for one seed, and keeps the energy with less effort than TD3. TQC and SAC are not quite as
+good as these two.
 """
 
     def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
