@@ -28,6 +28,7 @@ def test_what_is_expected_is_what_is_seen():
         assert np.abs(change - slopes[:, :, j]).max() <= 1e-8
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_filter_believes():
     """Errors normalised by the covariance are distributed as χ² with a degree of freedom for each entry."""
     options = {"observation_noise": NOISE, "track": math.inf}

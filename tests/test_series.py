@@ -468,7 +468,7 @@ def test_bits_do_not_depend_on_how_many_products_are_summed_side_by_side(system)
 
 @pytest.mark.parametrize(
     ("system", "width", "fused"),
-    [slow(SYSTEMS[1], 4, True), (SYSTEMS[1], 16, True), (SYSTEMS[3], 8, False)],
+    [slow(SYSTEMS[1], 4, True), (SYSTEMS[1], 16, True), slow(SYSTEMS[3], 8, False)],
     ids=["4", "16", "8 unfused"],
 )
 def test_bits_depend_neither_on_the_width_nor_on_the_neighbours(system, width, fused):

@@ -56,6 +56,7 @@ def test_trainings_that_fail_are_said_and_tried_again(search, tmp_path, monkeypa
     assert status == 0 and kept == [0, 1] and "seed 0" not in output
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_a_search_in_which_nothing_worked_has_no_table(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tune, "trial", dies)
