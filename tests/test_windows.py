@@ -3,7 +3,7 @@
 import gc
 import subprocess
 import sys
-import time
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -49,15 +49,18 @@ def test_window_shows_what_rgb_array_returns(window):
     env.close()
 
 
-def test_window_keeps_the_pace_of_the_control_interval(window):
+def test_window_keeps_the_pace_of_the_control_interval(window, monkeypatch):
+    """By a clock that only waiting advances, so that a busy machine changes nothing."""
+    now = [100.0]
+    clock = SimpleNamespace(perf_counter=lambda: now[0], sleep=lambda s: now.__setitem__(0, now[0] + s))
+    monkeypatch.setattr(rendering, "time", clock)
     env = gym.make(cylinder_in_cylinder.Tilt.id, render_mode="human")
     env.reset(seed=1)
-    start = time.perf_counter()
-    for _ in range(12):
+    start = now[0]
+    for _ in range(6):
         env.step(env.action_space.sample())
     env.close()
-    # What a busy machine lost before, up to a quarter of a second, is made up for.
-    assert time.perf_counter() - start > 0.9 * 12 * 0.05 - 0.25
+    assert now[0] - start == pytest.approx(6 * 0.05)
 
 
 def test_environments_share_the_window(window):

@@ -165,7 +165,8 @@ class PendulumExact(_Rod):
     note = (
         "The greedy policy of value iteration is best. Energy shaping, which hands over to an LQR near "
         "upright, takes as many swings, but arrives later: its torque fades as the energy gets near that of "
-        "upright. The learners lie between the two."
+        "upright. Among the learners the PPO in one file is best, and the others are about as good as energy "
+        "shaping; MPC is too."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
