@@ -190,7 +190,7 @@ def test_scenes_of_ones_own_are_drawn(own, open_page, tmp_path):
         height = page.evaluate("document.querySelector('.traces canvas').clientHeight")
         assert height == pytest.approx(4.75 * rem * heights.get(name, 2), abs=1)
         page.keyboard.press("End")
-        page.wait_for_function("document.querySelector('.clock').textContent.startsWith('0.80 ')")
+        until(page, "document.querySelector('.clock').textContent.startsWith('0.80 ')")
         assert (page.evaluate("document.querySelector('.scene').toDataURL()") != before) == drawn
     page = open_page("index", root=tmp_path.as_uri())
     assert colours(page, ".card:nth-child(1) canvas") > 10
