@@ -17,7 +17,16 @@ from covering import covering
 
 import lag_envs
 from lag_envs import cli, workers
-from lag_envs.benchmark import cold_start, contestants, divisions, docs, energies, jacobians, measurement
+from lag_envs.benchmark import (
+    chain_costs,
+    cold_start,
+    contestants,
+    divisions,
+    docs,
+    energies,
+    jacobians,
+    measurement,
+)
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import stagger_episodes
@@ -365,12 +374,27 @@ def test_how_often_steps_are_divided(tmp_path, capsys):
 @pytest.mark.slow
 def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(energies, "LONGEST", 2)
-    report = bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))
+    report = bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True, divisions=True))
     for id in ("CartPole, exact", "Chain(1)", "Chain(2)"):
         found = row(report, id, num_envs=3)
         assert found["problem"] is None and found["ratio"]
-    assert report["chains"]["bars"] == [1, 2]
-    assert "grows like the power" in capsys.readouterr().out
+    assert report["chains"]["bars"] == [1, 2] and report["chains"]["series"][0] == 1.0
+    assert "one series like the power" in capsys.readouterr().out
+
+
+def test_chains_in_the_documentation(tmp_path):
+    """Twice the series for twice the bars: the time of one grows more slowly by a power."""
+    rows = [
+        {"library": ENERGIES, "id": f"Chain({n})", "num_envs": 8, "steps_per_second": [0.0, 1e9 / n**4, 0.0]}
+        for n in (1, 2, 4)
+    ]
+    costs = chain_costs.chain_costs(rows, {1: 1.0, 2: 2.0, 4: 4.0})
+    text = docs.speed_markdown(report_of([2.0, 6.0, 3.0, 3.0]) | {"chains": costs})
+    assert "bars to the power 4, one series like the power 3" in text and "| 4 | 256 | 4.00 | 64 |" in text
+    for name in ("a.svg", "b.svg"):
+        chain_costs.write_figure(costs, tmp_path / name)
+    drawn = (tmp_path / "a.svg").read_text()
+    assert "one series" in drawn and drawn == (tmp_path / "b.svg").read_text()
 
 
 def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lag_envs.benchmark import divisions, jacobians
+from lag_envs.benchmark.chain_costs import cost_table, growth
 from lag_envs.benchmark.results import quartiles, times_of
 from lag_envs.tables import aligned
 
@@ -44,8 +45,7 @@ def report_lines(report: dict[str, Any]) -> list[str]:
         titles = ("environment", "envs", "products a step", "of the core's peak", "(quartiles)")
         lines += [*aligned([titles, *map(_share, found)]), ""]
     if found := report.get("chains"):
-        times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
-        lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
+        lines += [*aligned(cost_table(found)), growth(found), ""]
     if costs := report.get("jacobians"):
         lines += [*aligned(jacobians.jacobian_table(costs)), ""]
     if costs := report.get("backwards"):

@@ -36,11 +36,15 @@ def divisions(ids: Sequence[str]) -> list[dict[str, Any]]:
         For each one ``id``; ``mean`` and ``most`` substeps of a step, ``divided``, the share of steps with
         more than one, and ``fastest``, the largest velocity that occurred [SI].
     """
-    return [_divided(env_id) for env_id in ids if env_id in TASKS and not TASKS[env_id].imperfections]
+    return [
+        {"id": env_id} | divided(gym.make_vec(env_id, BATCH, autoreset_mode="SameStep").unwrapped)
+        for env_id in ids
+        if env_id in TASKS and not TASKS[env_id].imperfections
+    ]
 
 
-def _divided(env_id: str) -> dict[str, Any]:
-    envs: Any = gym.make_vec(env_id, BATCH, autoreset_mode="SameStep").unwrapped
+def divided(envs: Any) -> dict[str, Any]:
+    """Return how a vector environment's steps are divided: a row of `divisions` without its ``id``."""
     scene, dt, limit = envs.scene, envs.task.dt, int(envs.task.limit)
     fast = [i for i, entry in enumerate(layout_of(scene).state) if entry.kind != "place"]
     envs.reset(seed=0)
@@ -58,7 +62,6 @@ def _divided(env_id: str) -> dict[str, Any]:
             parts += [int(scene.step_bound(state, control, dt).substeps) for state, control in held]
     envs.close()
     return {
-        "id": env_id,
         "mean": round(float(np.mean(parts)), 3),
         "most": max(parts),
         "divided": round(float(np.mean(np.array(parts) > 1)), 3),

@@ -1,4 +1,4 @@
-"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md, and README's summary."""
+"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md, README's summary."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.benchmark import divisions
+from lag_envs.benchmark.chain_costs import Costs, cost_table, growth, write_figure
 from lag_envs.benchmark.results import times_of
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, SpeedTarget, has_own_flow, reached_targets
 from lag_envs.generated import replaced
 from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
+
+#: The picture of chains' costs, in docs.
+CHAINS = Path("images", "chains.svg")
 
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
@@ -20,6 +24,8 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
     write_file(checkout / "docs" / "speed.json", report_json(report))
     for path, text in texts(report, checkout).items():
         write_file(path, text)
+    if costs := _with_series(report):
+        write_figure(costs, checkout / "docs" / CHAINS)
 
 
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
@@ -79,6 +85,14 @@ def speed_markdown(report: dict[str, Any]) -> str:
     ]
     if told := list(filter(None, (_of_series(report["rows"], target) for target in SERIES_TARGETS))):
         parts.append(f"Scenes defined by energies alone, beside the same `CartPole-v1`: {'; '.join(told)}.")
+    if costs := _with_series(report):
+        head, *body = cost_table(costs)
+        parts += [
+            f"Chains of bars, pushed at random: {growth(costs)}. Longer chains whip faster, so the "
+            "certificate divides their steps into more series.",
+            markdown_table(head, body),
+            f"![Time of a step and of one series by the number of bars]({CHAINS.as_posix()})",
+        ]
     if found := report.get("divisions"):
         parts.append(
             "The number of series into which the certificate divides steps under random actions, and the "
@@ -90,6 +104,12 @@ def speed_markdown(report: dict[str, Any]) -> str:
         starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
         parts.append(f"A whole process (import, make, reset, first step) took {starts}.")
     return "\n\n".join(parts)
+
+
+def _with_series(report: dict[str, Any]) -> Costs | None:
+    """Return the costs of chains if their series were counted."""
+    costs: Costs | None = report.get("chains")
+    return costs if costs and "series" in costs else None
 
 
 def _of_series(rows: list[dict[str, Any]], target: SpeedTarget) -> str:

@@ -9,11 +9,12 @@ from typing import Any
 
 import lag_envs
 from lag_envs.benchmark import cold_start
+from lag_envs.benchmark.chain_costs import chain_costs, chain_divisions
 from lag_envs.benchmark.console import report_lines
 from lag_envs.benchmark.contestants import contestants
 from lag_envs.benchmark.divisions import divisions
 from lag_envs.benchmark.docs import report_json, take_over
-from lag_envs.benchmark.energies import chains, of_energies
+from lag_envs.benchmark.energies import of_energies
 from lag_envs.benchmark.jacobians import backwards, jacobians
 from lag_envs.benchmark.peak import arithmetic
 from lag_envs.benchmark.results import row_summary, speedups
@@ -63,6 +64,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
     times: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     sections: dict[str, Any] = {}
+    parts: dict[int, float] | None = None
     failure: Exception | None = None
     try:
         clock = CLOCKS[settings.clock]
@@ -74,6 +76,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
             sections["backwards"] = backwards(settings.rounds, clock)
         if complete and settings.divisions:
             sections["divisions"] = divisions(settings.ids)
+            parts = chain_divisions() if settings.energies else None
     except KeyboardInterrupt:
         complete = False
     except Exception as error:
@@ -89,7 +92,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
         "rows": results,
         "cold_start": cold,
         "targets": verdicts(results, {cache: found["seconds"] for cache, found in cold.items()}),
-        "chains": chains(results),
+        "chains": chain_costs(results, parts),
         "speedups": speedups(rows),
         "arithmetic": arithmetic(rows),
     } | sections
