@@ -132,17 +132,19 @@ def _submission(env_id: str, folder: Path) -> Any:
 
 
 def _model(env_id: str, task: Any, path: Path) -> Any:
-    """Return a model of Stable-Baselines3; loading it runs code."""
+    """Return a network of our own, or a model of Stable-Baselines3, whose loading runs code."""
     from lag_envs.leaderboard import export
     from lag_envs.leaderboard.sb3_models import ModelPolicy
 
     try:
+        source = export.find([path])[0]
+        if export.arrays_of(source.model) is not None:
+            return export.exported(source, env_id).agent
         import stable_baselines3  # noqa: F401
+
+        model, normalise = export.load_model(source, export.algorithm_of(source))
     except ImportError as error:
         raise UserError(f'{path}: stable-baselines3 is missing: pip install "lag-envs[agents]"') from error
-    try:
-        source = export.find([path])[0]
-        model, normalise = export.load_model(source, export.algorithm_of(source))
     except export.ExportError as error:
         raise UserError(str(error)) from error
     seen, own = model.observation_space.shape, source.frames * len(task.observation)
