@@ -38,6 +38,7 @@ from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
 from agents.train import command, here, planned_runs, print_returns, show_progress
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
+from lag_envs.leaderboard.networks import stacked
 from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
@@ -70,6 +71,7 @@ class Settings(LearnerSettings):
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which that noise is held")
     log_std_init: float = Field(ge=-20, le=5, description="its log standard deviation at the start")
+    frames: int = Field(ge=1, description="observations that actor and critic see: an episode's last ones")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     critic: list[PositiveInt] = Field(min_length=1, description="widths of the critic's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
@@ -111,16 +113,22 @@ class Policy:
         The number of values to choose from, for each action; empty for continuous actions.
     largest : float
         The largest continuous action; the lowest is minus this.
+    frames : int
+        How many observations the network sees, side by side.
     """
 
     def __init__(
-        self, layers: Sequence[tuple[Array, Array]], choices: tuple[int, ...], largest: float = 1.0
+        self,
+        layers: Sequence[tuple[Array, Array]],
+        choices: tuple[int, ...],
+        largest: float = 1.0,
+        frames: int = 1,
     ) -> None:
-        self.layers, self.choices, self.largest = layers, choices, largest
+        self.layers, self.choices, self.largest, self.frames = layers, choices, largest, frames
 
-    def outputs(self, observation: NDArray) -> tuple[Array, Array]:
-        """Return the last hidden layer (n, width) and the last layer (n, outputs)."""
-        hidden = observation
+    def outputs(self, seen: NDArray) -> tuple[Array, Array]:
+        """Return the last hidden layer (n, width) and the last layer (n, outputs) for what is seen."""
+        hidden = seen
         for weight, bias in self.layers[:-1]:
             hidden = np.tanh(hidden @ weight.T + bias)
         weight, bias = self.layers[-1]
@@ -138,9 +146,11 @@ class Policy:
         """Return the best action for each observation, as the leaderboard does: in float64, row by row.
 
         `outputs` is faster, but its last bits depend on how many rows there are, and in chaotic motion that
-        decides where an episode ends up.
+        decides where an episode ends up. With several frames, the memory is the observations seen.
         """
         seen = np.asarray(observation, np.float64)
+        if self.frames > 1:
+            seen = state = stacked(seen, self.frames, state, episode_start)
         x = np.ascontiguousarray(seen.reshape(-1, seen.shape[-1]))
         for k, (weight, bias) in enumerate(self.layers):
             x = np.tanh(x) if k else x
@@ -156,6 +166,7 @@ class Policy:
         layers = [{f"weight_{k}": w, f"bias_{k}": b} for k, (w, b) in enumerate(self.layers)]
         arrays = {name: array for layer in layers for name, array in layer.items()}
         arrays |= {"choices": np.array(self.choices, np.int64), "largest": np.array(self.largest)}
+        arrays |= {"frames": np.array(self.frames)} if self.frames > 1 else {}
         np.savez(file, allow_pickle=False, **arrays)
         write_file(path, file.getvalue())
 
@@ -165,7 +176,8 @@ class Policy:
         with np.load(path, allow_pickle=False) as found:
             count = sum(name.startswith("weight_") for name in found)
             layers = [(found[f"weight_{k}"], found[f"bias_{k}"]) for k in range(count)]
-            return cls(layers, tuple(found["choices"].tolist()), float(found["largest"]))
+            frames = int(found.get("frames", 1))
+            return cls(layers, tuple(found["choices"].tolist()), float(found["largest"]), frames)
 
 
 class GaussianActor:
@@ -222,14 +234,14 @@ class CategoricalActor:
 
 
 class Experience(NamedTuple):
-    """The experience of n environments in T steps."""
+    """The experience of n environments in T steps; observations are stacked."""
 
-    observations: Array  #: (T + 1, n, n_observation)
+    observations: Array  #: (T + 1, n, frames * n_observation)
     actions: NDArray  #: (T, n, n_actions)
     rewards: Array  #: (T, n)
     terminated: NDArray[np.bool_]  #: (T, n)
     over: NDArray[np.bool_]  #: (T, n)
-    final: Array  #: (T, n, n_observation); last observations of episodes, at the steps at which they end
+    final: Array  #: (T, n, frames * n_observation); episodes' last observations, at the steps where they end
 
 
 class Learner:
@@ -260,13 +272,14 @@ class Learner:
         )
         first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
         self.envs.reset(seed=first)
-        self.observation, _ = stagger(self.envs, limit, first)
+        # Episodes are under way already; what was observed before is not seen.
+        self.observation = stacked(stagger(self.envs, limit, first)[0], settings.frames)
         self.actions, self.shape = formulas.actions, self.envs.action_space.shape
 
         inputs, outputs = self.observation.shape[1], sum(formulas.choices) or formulas.actions
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
-        self.policy = Policy([], formulas.choices, formulas.largest)
+        self.policy = Policy([], formulas.choices, formulas.largest, settings.frames)
         self.head = (
             CategoricalActor(self.policy) if formulas.choices else GaussianActor(settings, formulas.actions)
         )
@@ -289,7 +302,7 @@ class Learner:
 
     def collect(self) -> Experience:
         """Let the policy act."""
-        steps, n = self.settings.n_steps, self.settings.n_envs
+        steps, n, frames = self.settings.n_steps, self.settings.n_envs, self.settings.frames
         wide = self.observation.shape[1]
         kind = np.int64 if self.policy.choices else np.float32
         found = Experience(
@@ -300,13 +313,15 @@ class Learner:
         for t in range(steps):
             found.observations[t] = self.observation
             found.actions[t] = self.head.sample(self.rng, t, *self.policy.outputs(self.observation))
-            self.observation, reward, found.terminated[t], truncated, infos = self.envs.step(
+            observation, reward, found.terminated[t], truncated, infos = self.envs.step(
                 found.actions[t].reshape(self.shape)
             )
             found.rewards[t] = self.settings.reward_scale * reward
             over = found.over[t] = found.terminated[t] | truncated
             if over.any():
-                found.final[t, over] = np.stack(infos["final_obs"][over])
+                last = np.stack(infos["final_obs"][over])
+                found.final[t, over] = stacked(last, frames, self.observation[over])
+            self.observation = stacked(observation, frames, self.observation, over)
         found.observations[steps] = self.observation
         return found
 

@@ -4,6 +4,7 @@ import json
 import re
 from concurrent.futures import Future
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,8 +18,9 @@ import lag_envs
 from agents import learners, ppo, race, submit, train, tune
 from agents.learners import load_policy, zoo_hyperparameters
 from agents.run import CHECKPOINT, MODEL, RESULT, Run, UserError, fresh_seeds
+from lag_envs import TASKS, watch
 from lag_envs.evaluation.rollout import play
-from lag_envs.leaderboard.export import ExportError, arrays_of, export, find
+from lag_envs.leaderboard.export import ExportError, arrays_of, export, exported, find
 from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.submission import load
 from lag_envs.scenes import Scene
@@ -131,14 +133,18 @@ def here(count, begin=None, *given):
 # --- runs ---
 
 
-def test_a_seed_decides_everything_with_interruptions_or_without(tmp_path):
-    whole, again, other = make_run(tmp_path / "a"), make_run(tmp_path / "b"), make_run(tmp_path / "c", seed=4)
+@pytest.mark.parametrize("frames", [1, slow(3)])
+def test_a_seed_decides_everything_with_interruptions_or_without(frames, tmp_path):
+    def made(name, seed=3):
+        return make_run(tmp_path / name, seed=seed, frames=frames)
+
+    whole, again, other = made("a"), made("b"), made("c", seed=4)
     assert go(whole) and go(again) and go(other)
     assert learnt(whole) == learnt(again) != learnt(other)
-    cut, before = make_run(tmp_path / "d"), 0
+    cut, before = made("d"), 0
     for until in (384, 640):  # in the middle of episodes, each time a step behind the last checkpoint
         assert not go(cut, until)
-        cut = make_run(tmp_path / "d")
+        cut = made("d")
         assert cut.load_checkpoint() is not None and before < cut.trained <= until
         before = cut.trained
     torch.manual_seed(0)
@@ -147,12 +153,19 @@ def test_a_seed_decides_everything_with_interruptions_or_without(tmp_path):
     assert cut.seconds > 0.0
 
 
-def test_the_policy_that_was_written_is_the_one_that_was_evaluated(tmp_path):
-    run = make_run(tmp_path)
+@pytest.mark.parametrize("frames", [1, 3])
+def test_the_policy_that_was_written_is_the_one_that_was_evaluated(frames, tmp_path):
+    run = make_run(tmp_path, frames=frames)
     go(run)
-    policy = load_policy(tmp_path)
     result = json.loads(run.path(RESULT).read_text())
-    assert play(ENV, policy, fresh_seeds(20)).tolist() == result["evaluation"]["returns"]
+    for policy in (
+        load_policy(tmp_path),
+        exported(find([tmp_path])[0], ENV).agent,
+        watch.load_agent(ENV, TASKS[ENV](), str(tmp_path))[1],
+    ):
+        assert play(ENV, policy, fresh_seeds(20)).tolist() == result["evaluation"]["returns"]
+    with pytest.raises(UserError, match="act in the package's environments alone"):
+        watch.load_agent("OwnCentre-v0", Centre(), str(tmp_path))
     assert result["versions"]["torch"] and result["hyperparameters"] == run.hyperparameters
     run.path(MODEL).write_bytes(b"nonsense")
     with pytest.raises(UserError, match=r"the policy in .* cannot be read"):
@@ -246,6 +259,36 @@ def test_rollouts_are_what_happened():
     assert len({tuple(np.flatnonzero(row)) for row in found.over}) > 2  # staggered
 
 
+def test_frames_are_the_last_observations_of_an_episode(monkeypatch):
+    learner, stepped = make_learner(episode_share=0.02, frames=3), []
+    wide, step = learner.observation.shape[1] // 3, learner.envs.step
+
+    def noted(actions):
+        result = step(actions)
+        stepped.append(deepcopy(result))
+        return result
+
+    monkeypatch.setattr(learner.envs, "step", noted)
+    seen = [[row[-wide:]] for row in learner.observation]
+
+    def last(observations):
+        return np.concatenate([*[np.zeros(wide)] * 3, *observations])[-3 * wide :]
+
+    ended = 0
+    for _ in range(2):
+        stepped.clear()
+        found = learner.collect()
+        for t, (observation, _, terminated, truncated, infos) in enumerate(stepped):
+            for i in range(8):
+                assert np.array_equal(found.observations[t, i], last(seen[i]))
+                if terminated[i] or truncated[i]:
+                    ended += 1
+                    assert np.array_equal(found.final[t, i], last([*seen[i], infos["final_obs"][i]]))
+                    seen[i] = []
+                seen[i].append(observation[i])
+    assert np.array_equal(learner.observation, [last(rows) for rows in seen]) and ended > 16
+
+
 @pytest.mark.parametrize("by_state", [True, False])
 def test_noise_has_the_probability_that_is_told(by_state):
     learner = make_learner(state_noise=by_state, noise_steps=3)
@@ -311,6 +354,7 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
             [ENV, "--gamma", "1.5"],
             "gamma: Input should be less than or equal to 1, got 1.5",
         ),
+        ([ENV, "--frames", "0"], "frames: Input should be greater than or equal to 1, got 0"),
         ([ENV, "--actor", "0"], "actor.0: Input should be greater than 0, got 0"),
         ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = "),
     ],
@@ -358,23 +402,29 @@ def test_five_seeds_are_a_submission(tmp_path):
         export(find([file]), tmp_path / "other", authors=["A"], license="MIT", env=ENV, seconds=1.0)
 
 
+@pytest.mark.parametrize("frames", [1, 3])
 @pytest.mark.parametrize("task", [pendulum.PendulumExact, cart_pole.CartPoleExact, arm.Reach])
-def test_networks_of_any_actions_act_as_on_the_leaderboard(task, tmp_path):
+def test_networks_of_any_actions_act_as_on_the_leaderboard(task, frames, tmp_path):
     """Actions beyond 1, actions from a list, two actions."""
     rng, formulas, wide = np.random.default_rng(0), task().formulas, len(task().observation)
     outputs, file = sum(formulas.choices) or formulas.actions, tmp_path / MODEL
     draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
-    layers = [(draw(8, wide), draw(8)), (draw(outputs, 8), draw(outputs))]
-    ppo.Policy(layers, formulas.choices, formulas.largest).save(file)
+    layers = [(draw(8, frames * wide), draw(8)), (draw(outputs, 8), draw(outputs))]
+    ppo.Policy(layers, formulas.choices, formulas.largest, frames).save(file)
     table, arrays = arrays_of(file)
-    submitted, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
-    policy = ppo.Policy.load(file)
-    loaded = policy.predict(seen)[0]
-    np.testing.assert_array_equal(loaded, submitted.predict(seen)[0])
-    assert np.ptp(loaded) >= formulas.largest
-    # To the bit, however many act together.
-    np.testing.assert_array_equal(loaded[:7], policy.predict(seen[:7])[0])
-    np.testing.assert_array_equal(loaded[0], policy.predict(seen[0])[0])
+    submitted, policy = architecture(task.id, table).agent(arrays), ppo.Policy.load(file)
+    states = [None] * 4
+    for _ in range(6):  # some episodes begin anew
+        seen, start = draw(200, wide), rng.random(200) < 0.2
+        loaded, states[0] = policy.predict(seen, states[0], start)
+        expected, states[1] = submitted.predict(seen, states[1], start)
+        np.testing.assert_array_equal(loaded, expected)
+        assert np.ptp(loaded) >= formulas.largest
+        # To the bit, however many act together.
+        some, states[2] = policy.predict(seen[:7], states[2], start[:7])
+        np.testing.assert_array_equal(loaded[:7], some)
+        one, states[3] = policy.predict(seen[0], states[3], start[:1])
+        np.testing.assert_array_equal(loaded[0], one)
 
 
 def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):

@@ -112,6 +112,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "state_noise": True,
         "noise_steps": 4,
         "log_std_init": 0.0,
+        "frames": 1,
         "actor": [32, 32],
         "critic": [64, 32],
         "first_layer_scale": 2.0,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lag_envs.errors import UserError, hint
 from lag_envs.leaderboard.shipped import shipped
 from lag_envs.scores import in_words
+from lag_envs.tasks import TASKS
 
 #: Supported extensions of video files.
 VIDEOS = (".mp4", ".gif")
@@ -66,8 +67,8 @@ def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = No
         Its task.
     name : str, optional
         One of `named_agents`, a verified submission of the board by name or id, or the path of a submission's
-        folder, of a model of Stable-Baselines3 or of the folder of its training. By default the first of
-        `named_agents`.
+        folder, of a model of Stable-Baselines3 or `agents.ppo`, or of the folder of its training. By default
+        the first of `named_agents`.
     board : Path, optional
         A board's folder.
 
@@ -132,17 +133,21 @@ def _submission(env_id: str, folder: Path) -> Any:
 
 
 def _model(env_id: str, task: Any, path: Path) -> Any:
-    """Return a model of Stable-Baselines3; loading it runs code."""
+    """Return a network of our own, or a model of Stable-Baselines3, whose loading runs code."""
     from lag_envs.leaderboard import export
     from lag_envs.leaderboard.sb3_models import ModelPolicy
 
     try:
+        source = export.find([path])[0]
+        if export.arrays_of(source.model) is not None:
+            if env_id not in TASKS:
+                raise UserError(f"{path} holds only arrays, which act in the package's environments alone")
+            return export.exported(source, env_id).agent
         import stable_baselines3  # noqa: F401
+
+        model, normalise = export.load_model(source, export.algorithm_of(source))
     except ImportError as error:
         raise UserError(f'{path}: stable-baselines3 is missing: pip install "lag-envs[agents]"') from error
-    try:
-        source = export.find([path])[0]
-        model, normalise = export.load_model(source, export.algorithm_of(source))
     except export.ExportError as error:
         raise UserError(str(error)) from error
     seen, own = model.observation_space.shape, source.frames * len(task.observation)

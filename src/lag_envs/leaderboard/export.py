@@ -155,10 +155,12 @@ def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | No
         with np.load(file, allow_pickle=False) as found:
             choices = found["choices"].tolist()
             arrays = {name: found[name] for name in found if name.startswith(("weight_", "bias_"))}
+            frames = int(found.get("frames", 1))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None
     hidden = [len(arrays[f"bias_{k}"]) for k in range(len(arrays) // 2 - 1)]
-    table = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
+    table: dict[str, Any] = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
+    table |= {"frames": frames} if frames > 1 else {}
     return table | ({} if choices else {"squash": "clip"}), arrays
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from lag_envs.leaderboard import protocol
@@ -43,6 +44,31 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 def bin_centres(bins: int) -> Array:
     """Return the centres of equal parts of [-1, 1], the actions of Gymnasium's ``DiscretizeAction``."""
     return (2.0 * np.arange(bins) + 1.0) / bins - 1.0
+
+
+def stacked(observation: NDArray, frames: int, before: NDArray | None = None, start: Any = None) -> NDArray:
+    """Return an episode's last observations side by side, the oldest first; before its first there are zeros.
+
+    Parameters
+    ----------
+    observation : ndarray, shape (..., n_observation)
+        The newest.
+    frames : int
+        How many to return.
+    before : ndarray, shape (..., frames * n_observation), optional
+        The result of the step before; without it, all episodes begin.
+    start : array_like of bool, shape (...), optional
+        Which episodes begin.
+    """
+    if frames == 1:
+        return observation
+    wide = observation.shape[-1]
+    if before is None:
+        before = np.zeros((*observation.shape[:-1], frames * wide), observation.dtype)
+    elif start is not None:
+        begins = np.resize(start, (*observation.shape[:-1], 1))
+        before = np.where(begins, before.dtype.type(0), before)
+    return np.concatenate([before[..., wide:], observation], axis=-1)
 
 
 class Normalise(Strict):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.leaderboard.networks import bin_centres
+from lag_envs.leaderboard.networks import bin_centres, stacked
 from lag_envs.tasks.base import Task
 
 
@@ -29,7 +29,6 @@ class ModelPolicy:
 
     def __init__(self, model: Any, task: Task, normalise: Any = None, frames: int = 1) -> None:
         self.model, self.normalise, self.frames = model, normalise, frames
-        self.width = len(task.observation)
         bins = None if task.formulas.choices else getattr(model.action_space, "n", None)
         self.centres = None if bins is None else bin_centres(int(bins)).astype(np.float32)
 
@@ -39,12 +38,7 @@ class ModelPolicy:
         """Return actions and the memory: earlier observations, or a recurrent model's own."""
         if self.frames == 1:
             return self.actions(observation, state, episode_start, deterministic)
-        if state is None:
-            state = np.zeros((*observation.shape[:-1], self.frames * self.width), observation.dtype)
-        elif episode_start is not None:
-            fresh = np.resize(episode_start, (*observation.shape[:-1], 1))
-            state = np.where(fresh, state.dtype.type(0), state)
-        state = np.concatenate([state[..., self.width :], observation], axis=-1)
+        state = stacked(observation, self.frames, state, episode_start)
         return self.actions(state, None, episode_start, deterministic)[0], state
 
     def actions(
