@@ -500,10 +500,15 @@ class Damping(Task):
     }
     hyperparameters = {
         "ppo": {**_PPO, "n_timesteps": 8e5},
+        "fast_ppo": {
+            "n_timesteps": 2e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
+            "reward_scale": 1.0, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
+            "first_layer_scale": 3.0,
+        },
         # The reward comes near rest, some swings later.
         "off_policy": {"n_steps": 4, "learning_rate": "lin_2e-3"},
         "td3": {"learning_rate": "lin_1e-3", "gradient_steps": 2, "policy_kwargs": {"noise": 0.3}},
-    }
+    }  # fmt: skip
     value_iteration = ValueIteration(
         (
             Axis("θ [rad]", -2.5, 2.5, 80, scale=0.03, level=4),
