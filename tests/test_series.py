@@ -19,6 +19,7 @@ import pytest
 from contract_scenes import ElasticPendulum, Trolley
 from covering import every, slow
 from llvmlite import binding, ir
+from mpmath import mp, mpf
 from series_systems import POINTS, SYSTEMS, System
 
 from lag_envs.mechanics.recording import parameter_values
@@ -552,6 +553,48 @@ def test_step_that_cannot_be_certified_is_refused(scene, state):
     trajectory[0] = state
     assert code.simulation(trajectory, np.zeros((2, 0)), 0.02, 16, *given) == 1
     np.testing.assert_array_equal(trajectory, [state] + [[7.0] * len(state)] * 2)
+
+
+class Spring(Scene):
+    """A spring with drag, linear; and if `beside`, a pendulum that it does not touch."""
+
+    stiffness: float = parameter(1e4, "N/m", above=0.0)
+    drag: float = parameter(0.0, "N s/m", least=0.0)
+    beside: float = parameter(0.0, "kg m²", least=0.0)
+    coordinates = {"x": "m", "phi": "rad"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.x**2 + v.phi**2)
+
+    def potential(self, q, xp):
+        return 0.5 * self.stiffness * q.x**2 - self.beside * xp.cos(q.phi)
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.drag * v.x**2
+
+
+@pytest.mark.parametrize("beside", [0.0, slow(1.0)])
+@pytest.mark.parametrize(
+    ("stiffness", "drag", "dt"),
+    [
+        (1e4, 0.0, 0.02), (1e5, 4.0, 0.02), (1e6, 0.0, 0.02), (6e6, 4.0, 0.02), (4e7, 0.0, 0.02),
+        (1e4, 0.0, 0.1), (1e2, 1e3, 0.02), (1e2, 1e4, 0.02), (1e2, 1e5, 0.02), (1e6, 2e3, 0.02),
+    ],
+)  # fmt: skip
+def test_stiff_linear_motion_is_accurate(stiffness, drag, dt, beside):
+    """Its series converges for any step, but the terms of a long one are many orders above the motion."""
+    scene = Spring(stiffness=stiffness, drag=drag, beside=beside)
+    with mp.workdps(80):
+        flow = mp.expm(mp.matrix([[0, 1], [-mpf(stiffness), -mpf(drag)]]) * mpf(dt))
+        wanted = np.array((flow * mp.matrix([1.0, 0.3])).tolist(), float)[:, 0]
+        slopes = np.array(flow.tolist(), float)
+    scale = np.array([1.0, math.sqrt(stiffness)])
+    after = scene.simulate([1.0, 0.3, 0.5, -1.0], 1, dt)[1]
+    assert (np.abs(after[:2] - wanted) < 1e-12 * scale).all()
+    found = scene.jacobian([1.0, 0.3, 0.5, -1.0], [], dt)[0][:2, :2]
+    assert (np.abs(found - slopes) < 4e-12 * scale[:, None] / scale).all()
+    bound = scene.step_bound([1.0, 0.3, 0.5, -1.0], [], dt)
+    assert bound.bounds["x"] < 2e-12 and bound.bounds["x_dot"] < 2e-12 * scale[1]
 
 
 class Sliding(Scene):

@@ -30,7 +30,7 @@ from lag_envs.report import reference as exact_ends
 from lag_envs.report.bound import driven
 from lag_envs.report.closed_forms import elliptic, linear
 from lag_envs.report.oracle import oracle_of
-from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
+from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, Scene, StepRefused, parameter
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import absent_from
@@ -559,6 +559,42 @@ def test_refused_step_keeps_the_rows_before():
 def test_bad_arguments(state, controls, dt, message):
     with pytest.raises(ValueError, match=message):
         PivotedBar(track=None).simulate(state, controls, dt)
+
+
+class Motor(Scene):
+    """A pendulum, or with `gravity` 0 a wheel, with a motor."""
+
+    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    coordinates = {"phi": "rad"}
+    controls = {"u": "N m"}
+    torque = staticmethod(lambda u, xp: u)
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.phi**2
+
+    def potential(self, q, xp):
+        return -self.gravity * xp.cos(q.phi)
+
+    def applied(self, q, v, u, xp):
+        return {"phi": self.torque(u.u, xp)}
+
+
+@pytest.mark.parametrize("gravity", [0.0, 9.81])
+@pytest.mark.parametrize("name", ["atan", "tanh", *map(slow, ["sin", "cos", "tan", "exp", "log", "sqrt"])])
+def test_functions_of_a_control(name, gravity):
+    """As the held value itself; in a flow of its own, or in the general series, which has all functions."""
+
+    class Shaped(Motor):
+        torque = staticmethod(lambda u, xp: getattr(xp, name)(u))
+
+    start, control, dt = [1.0, 0.3], 0.7, 0.02
+    value = getattr(np, {"atan": "arctan"}.get(name, name))(control)
+    after = Shaped(gravity=gravity).simulate(start, [control], dt)
+    np.testing.assert_allclose(after, Motor(gravity=gravity).simulate(start, [value], dt), rtol=1e-14)
+    slope = float(mp.diff(getattr(mp, name), control))
+    found = Shaped(gravity=gravity).jacobian(start, control, dt)[1]
+    wanted = slope * Motor(gravity=gravity).jacobian(start, value, dt)[1]
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 def test_no_controls():

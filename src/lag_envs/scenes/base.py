@@ -437,8 +437,9 @@ class Scene(metaclass=SceneType):
             over the substeps. Rounding, and the growth of earlier substeps' errors along the motion, are not
             included. The bound of w, where a rate is held, follows from those of place and velocity to first
             order. The bound of a pendulum is proved before the step, for plain substeps; if heavy damping
-            makes it follow the slow manifold instead, accuracy is tested, not proved. Linear motion is
-            stepped to rounding: in closed form, or by a series whose remainder is below rounding.
+            makes it follow the slow manifold instead, accuracy is tested, not proved. A mass with
+            linear drag and the turning slope are stepped to rounding: in closed form, or by a series whose
+            remainder is below rounding.
 
         Raises
         ------

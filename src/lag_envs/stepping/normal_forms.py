@@ -33,6 +33,7 @@ from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
+from lag_envs.stepping.tracing import Trace
 
 
 class CoefficientTerm(NamedTuple):
@@ -416,7 +417,7 @@ def _split(force: Expr, of: Mapping[Atom, str]) -> dict[str, _Parts] | None:
             kinds = {s.kind for s in Expr.of(atom).symbols()}
             if kinds <= {"parameter"}:
                 constant = (*constant, (atom, n))
-            elif kinds == {"control"} and n > 0:
+            elif kinds == {"control"} and n > 0 and _has_code(atom):
                 held = (*held, (atom, n))
             elif atom in of and n == 1 and not name:
                 name = of[atom]
@@ -426,6 +427,14 @@ def _split(force: Expr, of: Mapping[Atom, str]) -> dict[str, _Parts] | None:
         known = part.get(expr.text, (expr, Expr({})))[1]
         part[expr.text] = expr, known + Expr({constant: c})
     return parts
+
+
+def _has_code(atom: Atom) -> bool:
+    """Return whether a flow's code has all functions of an atom; the general series has atan and tanh too."""
+    if atom.argument is None:
+        return True
+    known = atom.function == "sum" or hasattr(Trace, atom.function)
+    return known and all(map(_has_code, atom.argument.atoms()))
 
 
 def _is_constant(expr: Expr) -> bool:
