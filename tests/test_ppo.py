@@ -387,9 +387,10 @@ def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
         ppo.Learner("OwnEndless-v0", settings, 0, 100)
 
 
-def test_five_seeds_are_a_submission(tmp_path):
+@pytest.mark.parametrize("frames", [1, slow(3)])
+def test_five_seeds_are_a_submission(frames, tmp_path):
     for seed in range(5):
-        go(make_run(tmp_path / "runs" / ENV / ppo.NAME / f"seed{seed}", seed=seed))
+        go(make_run(tmp_path / "runs" / ENV / ppo.NAME / f"seed{seed}", seed=seed, frames=frames))
     made = submit.submit_learned(ENV, tmp_path / "runs" / ENV / ppo.NAME, tmp_path / "out")
     assert made.name == "fast PPO" and len(load(tmp_path / "out").policies) == 5
     seen = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
