@@ -95,9 +95,7 @@ def loss(task: SwingUp) -> Callable[[Array], Array]:
     return lost
 
 
-def anywhere(
-    task: SwingUp, *, horizon: int = 90, good: float = 3.0, near: float = 0.5, **numbers: Any
-) -> MPC:
+def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: Any) -> MPC:
     """Return an MPC that plans at the start and after each kick, and leaves holding to a regulator.
 
     Parameters
@@ -108,19 +106,46 @@ def anywhere(
         Steps to plan ahead.
     good : float
         Loss after the plan's end below which the plan counts as good.
+    **numbers
+        Other arguments of `MPC`, and of `held`.
+    """
+    easy = easier(task, effort=0.05, share=1.0, edge=0.95)
+    return held(
+        task, horizon=horizon, good=good, easier=easy, **({"every": horizon, "iterations": 6} | numbers)
+    )
+
+
+def renewed(task: SwingUp, *, beyond: float = 1.6, **numbers: Any) -> MPC:
+    """Return an MPC that begins with recorded plans, and leaves holding to a regulator.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``.
+    beyond : float
+        How far to plan, as a multiple of the longest recorded plan.
+    **numbers
+        Other arguments of `MPC`, and of `held`.
+    """
+    first = [recorded(task)]
+    if task.quick:
+        quick = recorded(task, "quick")
+        first += [quick, quick.mirrored()]
+    longest = max(len(plan.actions) for plan in first)
+    return held(task, horizon=round(beyond * longest * task.interval / task.dt), first=first, **numbers)
+
+
+def held(task: SwingUp, *, near: float = 0.5, **numbers: Any) -> MPC:
+    """Return an MPC whose final cost is a regulator's loss, and which leaves holding to a regulator.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``.
     near : float
         Loss below which the regulator is in charge.
     **numbers
         Other arguments of `MPC`.
     """
     lost = loss(task)
-    return MPC(
-        task,
-        lost,
-        horizon=horizon,
-        good=good,
-        easier=easier(task, effort=0.05, share=1.0, edge=0.95),
-        hold=hold(task),
-        holds=lambda states: lost(states) < near,
-        **({"every": horizon, "iterations": 6} | numbers),
-    )
+    return MPC(task, lost, hold=hold(task), holds=lambda states: lost(states) < near, **numbers)
