@@ -58,6 +58,10 @@ class ILQR:
         Largest number of iterations.
     tolerance : float
         The iteration ends if the return improves by less.
+    gains : callable, optional
+        Takes states (n, steps, n_state) and actions of finished plans, returns their feedback (n, steps,
+        n_actions, n_state). By default it is that of the last iteration, optimal near an optimal plan. But
+        an action whose Newton step leads beyond its bounds has none.
 
     References
     ----------
@@ -75,6 +79,7 @@ class ILQR:
         steps: int | None = None,
         iterations: int = 100,
         tolerance: float = 1e-3,
+        gains: Callable[[Array, Array], Array] | None = None,
     ) -> None:
         check_continuous("iLQR", task)
         if task.draws:
@@ -82,7 +87,7 @@ class ILQR:
         self.task, self.guesses, self.tail = task, guesses, tail
         self.after = guesses[0] if after is None and guesses else after
         self.steps = int(min(task.limit, 1000 if steps is None else steps))
-        self.iterations, self.tolerance = iterations, tolerance
+        self.iterations, self.tolerance, self.gains = iterations, tolerance, gains
         self.flat = FLAT * task.dt / task.interval
         self.largest, self.count = task.formulas.largest, task.formulas.actions
         self.model, self.read = Model(task), ObservationDecoder(task)
@@ -189,7 +194,7 @@ class ILQR:
         plan = plan._replace(states=states, actions=actions)
         damping = np.full(n, 10.0 * self.flat)
         going = np.arange(n)
-        for iteration in range(self.iterations + 1):
+        for iteration in range(self.iterations + (self.gains is None)):
             slopes = self._expand(plan.states[going], plan.actions[going], targets[going])
             change, gains = self._solve(plan.actions[going], damping[going], *slopes)
             plan.gains[going] = gains
@@ -208,6 +213,8 @@ class ILQR:
             going = going[~done]
             if not len(going):
                 break
+        if self.gains is not None:
+            plan.gains[:] = self.gains(plan.states, plan.actions)
         return plan, returns
 
     def _play(

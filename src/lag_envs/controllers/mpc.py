@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names
 from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
+from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.swing_up import away
-from lag_envs.controllers.tracking import Tracking, waves
+from lag_envs.controllers.tracking import Tracking, smoothed, waves
 from lag_envs.tasks.base import Task
 
 Tail = Callable[[Array], Array]
@@ -105,12 +106,14 @@ class MPC:
                 )
         self.task, self.horizon, self.every = task, horizon, min(every, horizon)
         self.first = first
+        self.model = smoothed(task) if first else task
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
         self.largest, self.count = task.formulas.largest, task.formulas.actions
         self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
         calm = without_kicks(task)
-        self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations)
+        gains = None if not first else self._gains
+        self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations, gains=gains)
         self.idle = np.atleast_1d(task.rest_action) + 0.0  # no -0.0
         self.polisher = ILQR(calm, [], tail=tail, steps=horizon, iterations=5 * iterations)
         searched, end = easier or (calm, tail)
@@ -214,6 +217,17 @@ class MPC:
             return actions
 
         return self._best(self.planner, x, targets, m, act)
+
+    def _gains(self, states: Array, actions: Array) -> Array:
+        """Return the feedback (n, horizon, n_actions, n_state) along plans: that along recorded ones."""
+        n, width = len(states), states.shape[-1]
+        plans, gains = self.task.plans, np.empty((n, self.horizon, self.count, width))
+        for i in range(n):
+            acted = actions[i, :, 0] if self.count == 1 else actions[i]
+            ended = np.append(states[i], [plans.rest], axis=0)  # the end itself does not matter
+            found, _ = time_varying(self.model, ended, acted, plans.rest, plans.weights, plans.effort)
+            gains[i] = -found.reshape(gains.shape[1:])
+        return gains
 
     def _ends_badly(self, states: Array, actions: Array, targets: Array) -> NDArray[np.bool_]:
         """Return which plans end badly."""
