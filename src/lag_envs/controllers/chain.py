@@ -115,24 +115,24 @@ def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: 
     )
 
 
-def renewed(task: SwingUp, *, beyond: float = 1.6, **numbers: Any) -> MPC:
-    """Return an MPC that begins with recorded plans, and leaves holding to a regulator.
+def renewed(task: SwingUp, *, beyond: float = 1.1, iterations: int = 1, **numbers: Any) -> MPC:
+    """Return an MPC that begins with a recorded plan, renews it in time, and leaves holding to a regulator.
 
     Parameters
     ----------
     task : SwingUp
-        The task, ``env.unwrapped.task``.
+        The task, ``env.unwrapped.task``. Each episode begins with one of its recorded plans, or its image.
     beyond : float
         How far to plan, as a multiple of the longest recorded plan.
+    iterations : int
+        Iterations of iLQR for a renewal.
     **numbers
         Other arguments of `MPC`, and of `held`.
     """
-    first = [recorded(task)]
-    if task.quick:
-        quick = recorded(task, "quick")
-        first += [quick, quick.mirrored()]
-    longest = max(len(plan.actions) for plan in first)
-    return held(task, horizon=round(beyond * longest * task.interval / task.dt), first=first, **numbers)
+    plans = [recorded(task, kind) for kind in (["followed", "quick"] if task.quick else ["followed"])]
+    horizon = round(beyond * max(len(plan.actions) for plan in plans) * task.interval / task.dt)
+    first = [*plans, *(plan.mirrored() for plan in plans)]
+    return held(task, first=first, horizon=horizon, iterations=iterations, **numbers)
 
 
 def held(task: SwingUp, *, near: float = 0.5, **numbers: Any) -> MPC:

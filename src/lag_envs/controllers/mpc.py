@@ -46,7 +46,7 @@ class MPC:
         Steps to plan ahead.
     first : sequence of Tracking
         Recorded plans of the task, from which each episode's first plan is made. With these, nothing is
-        searched for at the start.
+        searched for at the start, and all plans are followed by the feedback that `Task.plans` specifies.
     every : int
         Steps after which a plan is renewed.
     iterations : int
@@ -98,6 +98,8 @@ class MPC:
         ):
             if number < 1:
                 raise ValueError(f"{name} must be at least 1, got {number}")
+        if first and task.plans is None:
+            raise ValueError(f"first: {type(task).__name__} has no `plans`, which specify the feedback")
         for guess in first:
             if guess.task.scene != task.scene or type(guess.task) is not type(task):
                 raise ValueError(
