@@ -279,9 +279,7 @@ def test_mpc_from_recorded_plans_holds_all_bars(kind, least):
 def test_mpc_begins_only_with_plans_of_its_task():
     task, other = chain.SwingUp(), chain.SwingUp(bars=3)
     for law in (recorded(chain.SwingUpWeak()), hold(other), recorded(chain.SwingUp(damping=0.0))):
-        with pytest.raises(
-            ValueError, match=r"first: a plan for Chain\(.* cannot guide SwingUp"
-        ):
+        with pytest.raises(ValueError, match=r"first: a plan for Chain\(.* cannot guide SwingUp"):
             MPC(task, first=[law])
     unplanned = chain.Balance()
     law = Tracking(unplanned, **{name: getattr(recorded(task), name) for name in Tracking.DATA})
