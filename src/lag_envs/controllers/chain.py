@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, ObservationDecoder, remade
 from lag_envs.controllers.ilqr import ILQR
-from lag_envs.controllers.linear import regulator
-from lag_envs.controllers.mpc import MPC
+from lag_envs.controllers.linear import BalanceLQR, regulator
+from lag_envs.controllers.mpc import MPC, without_kicks
 from lag_envs.controllers.tracking import Tracking, hold, recorded
+from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.chain import SwingUp
+from lag_envs.tasks.chain import Balance, SwingUp
 
 
 def easier(
@@ -149,3 +151,37 @@ def held(task: SwingUp, *, near: float = 0.5, **numbers: Any) -> MPC:
     """
     lost = loss(task)
     return MPC(task, lost, hold=hold(task), holds=lambda states: lost(states) < near, **numbers)
+
+
+def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **numbers: Any) -> MPC:
+    """Return a regulator that leaves states from which it would lose the bars to an MPC.
+
+    Parameters
+    ----------
+    task : Balance
+        The task, ``env.unwrapped.task``.
+    weights : mapping
+        Weights of the regulator, see `BalanceLQR`.
+    ahead : int
+        For how many steps without kicks the regulator must keep the bars upright.
+    **numbers
+        Other arguments of `MPC`.
+    """
+    lqr, model = BalanceLQR(task, **weights), Model(without_kicks(task))
+    holding = Tracking(
+        task, states=[lqr.rest], actions=[], gains=np.empty((0, len(lqr.rest))), rest=lqr.rest,
+        hold=lqr.gain / task.limit_control,
+    )  # fmt: skip
+
+    def survives(states: Array) -> NDArray[np.bool_]:
+        alive, forever = np.ones(len(states), np.bool_), np.full(len(states), np.inf)
+        for _ in range(ahead):
+            states, _, ended = model(states, holding.act(states, forever, forever))
+            alive &= ~ended
+        return alive
+
+    def lost(states: Array) -> Array:
+        off = states - lqr.rest
+        return np.minimum(np.einsum("ni,ij,nj->n", off, lqr.cost, off), 1e4)
+
+    return MPC(task, lost, hold=holding, holds=survives, **numbers)
