@@ -11,11 +11,13 @@ from covering import slow
 
 from agents import optimum, plans
 from lag_envs.controllers import build, make_controller
-from lag_envs.controllers.basic import Constant, feedback
+from lag_envs.controllers.basic import Constant, ObservationDecoder, feedback
 from lag_envs.controllers.chain import loss, replan
+from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.mpc import MPC, without_kicks
-from lag_envs.controllers.tracking import Tracking, follow, recorded, search
+from lag_envs.controllers.tracking import Tracking, follow, hold, recorded, search
+from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.tasks import chain, pivoted_bar
 
@@ -232,3 +234,72 @@ def test_mpc_for_any_task():
         with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
             MPC(task, **{name: 0})
     assert build(task, "zero") is not None
+
+
+# --- from a recorded plan ---
+
+
+def test_mpc_begins_with_the_best_recorded_plan():
+    task = chain.SwingUp()
+    agent = make_controller(task.id, "MPC")
+    assert agent.horizon == round(1.1 * len(recorded(task, "quick").actions)) and len(agent.first) == 4
+    start = np.array([task.centre, [0.01, 0.02, -0.1, 0.05, 0.1, -0.05]])
+    found = agent._begin(start, np.zeros(2))
+    for i, x in enumerate(start):
+        values = []
+        for law in agent.first:
+            worse = ILQR(task, [law], tail=agent.tail, steps=agent.horizon, iterations=1, gains=agent._gains)
+            plan, value = worse.plan(x[None], np.zeros(1))
+            values.append((value[0], plan.actions[0]))
+        best = max(values, key=lambda one: one[0])
+        np.testing.assert_allclose(found.actions[i], best[1], atol=1e-5)
+        law = follow(task, [*found.states[i], task.plans.rest], found.actions[i, :, 0], task.plans)
+        np.testing.assert_allclose(found.gains[i, :, 0], -law.gains)
+
+
+def test_mpc_from_recorded_plans_is_the_same_alone():
+    env_id, agents = chain.SwingUp.id, [make_controller(chain.SwingUp.id, "MPC") for _ in range(2)]
+    rollouts = [Rollout(env_id, agent, SEEDS[:n]) for agent, n in zip(agents, (3, 1), strict=True)]
+    for k, (together, alone) in enumerate(zip(*rollouts, strict=True)):
+        assert (together.action[0] == alone.action[0]).all()
+        if k == 20:
+            break
+
+
+@pytest.mark.parametrize(
+    ("kind", "least"),
+    [(chain.SwingUp, 448.0), slow(chain.SwingUpWeak, 405.0), slow(chain.SwingUpTriple, 405.0)],
+    ids=lambda one: getattr(one, "id", ""),
+)
+def test_mpc_from_recorded_plans_holds_all_bars(kind, least):
+    rollout = Rollout(kind.id, make_controller(kind.id, "MPC"), SEEDS[:3])
+    assert rollout.run().min() > least
+    assert np.cos(rollout.state[:, 2::2]).max() < -0.999
+
+
+def test_mpc_begins_only_with_plans_of_its_task():
+    task, other = chain.SwingUp(), chain.SwingUp(bars=3)
+    for law in (recorded(chain.SwingUpWeak()), hold(other), recorded(chain.SwingUp(damping=0.0))):
+        with pytest.raises(ValueError, match=r"first: a plan for Chain\(.* cannot guide SwingUp"):
+            MPC(task, first=[law])
+    unplanned = chain.Balance()
+    law = Tracking(unplanned, **{name: getattr(recorded(task), name) for name in Tracking.DATA})
+    with pytest.raises(ValueError, match="first: Balance has no `plans`, which specify the feedback"):
+        MPC(unplanned, first=[law])
+
+
+def test_mpc_rescues_what_the_regulator_would_lose():
+    task = chain.Balance()
+    model, read = Model(without_kicks(task)), ObservationDecoder(task)
+    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (16, 6)) * [0.1, 0.2, 0.12, 0.8, 0.12, 0.8]
+    saved = {}
+    for name in ("LQR", "MPC"):
+        agent, memory, states = build(task, name), None, task.examples.rest + spread
+        alive = np.ones(len(states), np.bool_)
+        for _ in range(60):
+            actions, memory = agent.predict(read.expected(states)[0].astype(np.float32), memory)
+            moved, _, ended = model(states, actions[:, 0])
+            alive &= ~ended
+            states = np.where(alive[:, None], moved, task.examples.rest)  # else the lost slow the planner
+        saved[name] = alive
+    assert (saved["MPC"] >= saved["LQR"]).all() and saved["MPC"].sum() > saved["LQR"].sum()

@@ -274,6 +274,12 @@ def check_single_control(what: str, task: Task) -> None:
         raise ValueError(f"{what} takes one control with continuous actions; {type(task).__name__} has {has}")
 
 
+def beginning(n: int, state: Any, episode_start: ArrayLike | None) -> NDArray[np.bool_]:
+    """Return which of n episodes begin: without a memory all, else those that `predict` is told."""
+    fresh = np.full(n, state is None)
+    return fresh if episode_start is None else fresh | np.asarray(episode_start, np.bool_).reshape(n)
+
+
 def hold_law(task: Task, rest: Array, gain: Array, read: ObservationDecoder) -> FeedbackLaw:
     """Return the feedback with controls -K (x - rest), K of shape (n_state,) or (n_actions, n_state)."""
     scale, offset = per_control(task.formulas)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, check_names
+from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names
 from lag_envs.controllers.mpc import without_kicks
 from lag_envs.controllers.swing_up import away
 from lag_envs.envs.model import Model
@@ -138,9 +138,9 @@ class BeamSearch:
         values = np.asarray(observation)
         x, targets = self.read(values.reshape(-1, values.shape[-1]))
         n, entries = x.shape
-        fresh = np.zeros(n, np.bool_)
+        fresh = beginning(n, state, episode_start)
         if state is None:
-            fresh[:], count, shape = True, np.zeros(n, np.intp), (n, self.horizon)
+            count, shape = np.zeros(n, np.intp), (n, self.horizon)
             state = Followed(
                 count,
                 count,
@@ -150,8 +150,6 @@ class BeamSearch:
                 np.zeros(shape, np.intp),
                 np.zeros(shape),
             )
-        if episode_start is not None:
-            fresh |= np.asarray(episode_start, np.bool_).reshape(n)
         plan = state._replace(**{name: getattr(state, name).copy() for name in state._fields})
         plan.wait[:] = np.maximum(plan.wait - 1, 0)
         now = np.minimum(plan.step, self.horizon - 1)

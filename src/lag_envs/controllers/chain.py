@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, ObservationDecoder, remade
 from lag_envs.controllers.ilqr import ILQR
-from lag_envs.controllers.linear import regulator
-from lag_envs.controllers.mpc import MPC
+from lag_envs.controllers.linear import BalanceLQR, regulator
+from lag_envs.controllers.mpc import MPC, without_kicks
 from lag_envs.controllers.tracking import Tracking, hold, recorded
+from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.chain import SwingUp
+from lag_envs.tasks.chain import Balance, SwingUp
 
 
 def easier(
@@ -95,9 +97,7 @@ def loss(task: SwingUp) -> Callable[[Array], Array]:
     return lost
 
 
-def anywhere(
-    task: SwingUp, *, horizon: int = 90, good: float = 3.0, near: float = 0.5, **numbers: Any
-) -> MPC:
+def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: Any) -> MPC:
     """Return an MPC that plans at the start and after each kick, and leaves holding to a regulator.
 
     Parameters
@@ -108,19 +108,80 @@ def anywhere(
         Steps to plan ahead.
     good : float
         Loss after the plan's end below which the plan counts as good.
+    **numbers
+        Other arguments of `MPC`, and of `held`.
+    """
+    easy = easier(task, effort=0.05, share=1.0, edge=0.95)
+    return held(
+        task, horizon=horizon, good=good, easier=easy, **({"every": horizon, "iterations": 6} | numbers)
+    )
+
+
+def renewed(task: SwingUp, *, beyond: float = 1.1, iterations: int = 1, **numbers: Any) -> MPC:
+    """Return an MPC that begins with a recorded plan, renews it in time, and leaves holding to a regulator.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``. Each episode begins with one of its recorded plans, or its image.
+    beyond : float
+        How far to plan, as a multiple of the longest recorded plan.
+    iterations : int
+        Iterations of iLQR for a renewal.
+    **numbers
+        Other arguments of `MPC`, and of `held`.
+    """
+    plans = [recorded(task, kind) for kind in (["followed", "quick"] if task.quick else ["followed"])]
+    horizon = round(beyond * max(len(plan.actions) for plan in plans) * task.interval / task.dt)
+    first = [*plans, *(plan.mirrored() for plan in plans)]
+    return held(task, first=first, horizon=horizon, iterations=iterations, **numbers)
+
+
+def held(task: SwingUp, *, near: float = 0.5, **numbers: Any) -> MPC:
+    """Return an MPC whose final cost is a regulator's loss, and which leaves holding to a regulator.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``.
     near : float
         Loss below which the regulator is in charge.
     **numbers
         Other arguments of `MPC`.
     """
     lost = loss(task)
-    return MPC(
-        task,
-        lost,
-        horizon=horizon,
-        good=good,
-        easier=easier(task, effort=0.05, share=1.0, edge=0.95),
-        hold=hold(task),
-        holds=lambda states: lost(states) < near,
-        **({"every": horizon, "iterations": 6} | numbers),
-    )
+    return MPC(task, lost, hold=hold(task), holds=lambda states: lost(states) < near, **numbers)
+
+
+def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **numbers: Any) -> MPC:
+    """Return a regulator that leaves states from which it would lose the bars to an MPC.
+
+    Parameters
+    ----------
+    task : Balance
+        The task, ``env.unwrapped.task``.
+    weights : mapping
+        Weights of the regulator, see `BalanceLQR`.
+    ahead : int
+        For how many steps without kicks the regulator must keep the bars upright.
+    **numbers
+        Other arguments of `MPC`.
+    """
+    lqr, model = BalanceLQR(task, **weights), Model(without_kicks(task))
+    holding = Tracking(
+        task, states=[lqr.rest], actions=[], gains=np.empty((0, len(lqr.rest))), rest=lqr.rest,
+        hold=lqr.gain / task.limit_control,
+    )  # fmt: skip
+
+    def survives(states: Array) -> NDArray[np.bool_]:
+        alive, forever = np.ones(len(states), np.bool_), np.full(len(states), np.inf)
+        for _ in range(ahead):
+            states, _, ended = model(states, holding.act(states, forever, forever))
+            alive &= ~ended
+        return alive
+
+    def lost(states: Array) -> Array:
+        off = states - lqr.rest
+        return np.minimum(np.einsum("ni,ij,nj->n", off, lqr.cost, off), 1e4)
+
+    return MPC(task, lost, hold=holding, holds=survives, **numbers)

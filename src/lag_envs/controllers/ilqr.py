@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, check_continuous
+from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_continuous
 from lag_envs.envs.model import REACH, Model
 from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
@@ -21,6 +21,8 @@ SHARES = 0.5 ** np.arange(0, 10, 1.5)
 SWEEPS = 20
 #: Smallest trusted curvature over an action [reward/action²], in a step of the task's own interval.
 FLAT = 1e-4
+#: States (..., n_state), targets and the step of a roll-out to actions (..., n_actions).
+Feedback = Callable[[Array, Array, int], Array]
 
 
 class Plan(NamedTuple):
@@ -56,6 +58,10 @@ class ILQR:
         Largest number of iterations.
     tolerance : float
         The iteration ends if the return improves by less.
+    gains : callable, optional
+        Takes states (n, steps, n_state) and actions of finished plans, returns their feedback (n, steps,
+        n_actions, n_state). By default it is that of the last iteration, optimal near an optimal plan. But
+        an action whose Newton step leads beyond its bounds has none.
 
     References
     ----------
@@ -73,6 +79,7 @@ class ILQR:
         steps: int | None = None,
         iterations: int = 100,
         tolerance: float = 1e-3,
+        gains: Callable[[Array, Array], Array] | None = None,
     ) -> None:
         check_continuous("iLQR", task)
         if task.draws:
@@ -80,7 +87,7 @@ class ILQR:
         self.task, self.guesses, self.tail = task, guesses, tail
         self.after = guesses[0] if after is None and guesses else after
         self.steps = int(min(task.limit, 1000 if steps is None else steps))
-        self.iterations, self.tolerance = iterations, tolerance
+        self.iterations, self.tolerance, self.gains = iterations, tolerance, gains
         self.flat = FLAT * task.dt / task.interval
         self.largest, self.count = task.formulas.largest, task.formulas.actions
         self.model, self.read = Model(task), ObservationDecoder(task)
@@ -97,11 +104,7 @@ class ILQR:
         values = np.asarray(observation)
         x, target = (v.reshape(-1, *v.shape[values.ndim - 1 :]) for v in self.read(values))
         n = len(x)
-        fresh = np.ones(n, np.bool_)
-        if state is not None:
-            fresh = np.zeros(n, np.bool_)
-            if episode_start is not None:
-                fresh |= np.asarray(episode_start, np.bool_).reshape(n)
+        fresh = beginning(n, state, episode_start)
         plan = self._blank(n) if state is None else state
         if fresh.any():
             new, _ = self.plan(x[fresh], target[fresh])
@@ -135,8 +138,7 @@ class ILQR:
         best: Plan | None = None
         most = np.full(len(starts), -math.inf)
         for guess in self.guesses:
-            actions = self._guess(guess, starts, targets)
-            plan, returns = self.improve(starts, targets, actions)
+            plan, returns = self.improve(starts, targets, self._acting(guess))
             if best is None:
                 best, most = plan, returns
                 continue
@@ -165,37 +167,41 @@ class ILQR:
         each = np.shape(self.task.target_range)
         return np.broadcast_to(targets, (*shape, *each)).reshape(-1, *each)
 
-    def _guess(self, guess: Any, starts: Array, targets: Array) -> Array:
-        """Return a controller's actions (n, steps, n_actions)."""
-        x, memory, actions = starts, None, np.empty((len(starts), self.steps, self.count))
-        form, formulas = form_of(self.task.scene), self.task.formulas
-        goals = [*np.reshape(targets, (len(starts), -1)).T][: formulas.targets]
-        for t in range(self.steps):
-            lifted = form.lift(x) if form else tuple(x.T)
-            seen = formulas.observe(np, lifted, goals, self._k)
-            observation = np.stack(np.broadcast_arrays(*seen), axis=-1)
-            actions[:, t], memory = guess.predict(observation, memory)
-            x = self.advance(x, actions[:, t], targets)[0]
-        return actions
+    def _acting(self, guess: Any) -> Feedback:
+        """Return the feedback that a controller is in one roll-out."""
+        memory, form, formulas = None, form_of(self.task.scene), self.task.formulas
 
-    def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
-        """Return plans improved from actions (n, steps, n_actions), and their returns less the final cost."""
+        def act(x: Array, targets: Array, step: int) -> Array:
+            nonlocal memory
+            lifted = form.lift(x) if form else tuple(x.T)
+            goals = [*np.reshape(targets, (len(x), -1)).T][: formulas.targets]
+            seen = formulas.observe(np, lifted, goals, self._k)
+            actions, memory = guess.predict(np.stack(np.broadcast_arrays(*seen), axis=-1), memory)
+            return np.asarray(actions)
+
+        return act
+
+    def improve(self, starts: Array, targets: Array, guess: Array | Feedback) -> tuple[Plan, Array]:
+        """Return plans improved from a guess, and their returns less the final cost.
+
+        The guess is actions (n, steps, n_actions), or feedback: a function of states (n, n_state), targets
+        and the step that returns actions (n, n_actions).
+        """
         n = len(starts)
         plan = self._blank(n)
-        states, actions, returns = self._play(
-            starts, targets, plan.states, actions, plan.gains, plan.actions, np.zeros(1)
-        )  # fmt: skip
+        act = guess if callable(guess) else lambda x, targets, step: guess[:, step]
+        states, actions, returns = self._roll_out(starts, targets, act)
         plan = plan._replace(states=states, actions=actions)
         damping = np.full(n, 10.0 * self.flat)
         going = np.arange(n)
-        for iteration in range(self.iterations + 1):
+        for iteration in range(self.iterations + (self.gains is None)):
             slopes = self._expand(plan.states[going], plan.actions[going], targets[going])
             change, gains = self._solve(plan.actions[going], damping[going], *slopes)
             plan.gains[going] = gains
             if iteration == self.iterations:
                 break
             states, actions, tried = self._play(
-                starts[going], targets[going], plan.states[going], plan.actions[going], gains, change, SHARES
+                starts[going], targets[going], plan.states[going], plan.actions[going], gains, change
             )
             gain = tried - returns[going]
             better = gain > 0.0
@@ -207,31 +213,39 @@ class ILQR:
             going = going[~done]
             if not len(going):
                 break
+        if self.gains is not None:
+            plan.gains[:] = self.gains(plan.states, plan.actions)
         return plan, returns
 
     def _play(
-        self, starts: Array, targets: Array, states: Array, actions: Array, gains: Array, change: Array,
-        shares: Array,
-    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        self, starts: Array, targets: Array, states: Array, actions: Array, gains: Array, change: Array
+    ) -> tuple[Array, Array, Array]:
         """Return states, actions and returns of the plans changed by the best of several step sizes."""
-        n, lines = len(starts), len(shares)
-        x = np.repeat(starts[:, None], lines, axis=1)
-        goals = targets[:, None]
-        xs = np.empty((n, lines, self.steps, x.shape[-1]))
-        us = np.empty((n, lines, self.steps, self.count))
-        total, alive = np.zeros((n, lines)), np.ones((n, lines), np.bool_)
-        for t in range(self.steps):
+
+        def act(x: Array, targets: Array, t: int) -> Array:
             feedback = np.einsum("iaj,ikj->ika", gains[:, t], x - states[:, None, t])
-            u = actions[:, t, None] + shares[:, None] * change[:, t, None] + feedback
-            u = np.clip(u, -self.largest, self.largest)
-            xs[:, :, t], us[:, :, t] = x, u
-            x, reward, ended = self.advance(x, u, goals)
+            return actions[:, t, None] + SHARES[:, None] * change[:, t, None] + feedback
+
+        x = np.repeat(starts[:, None], len(SHARES), axis=1)
+        xs, us, total = self._roll_out(x, targets[:, None], act)
+        rows, best = np.arange(len(starts)), total.argmax(axis=1)
+        return xs[rows, best], us[rows, best], total[rows, best]
+
+    def _roll_out(self, x: Array, targets: Array, act: Feedback) -> tuple[Array, Array, Array]:
+        """Return states, actions and returns of feedback from states (..., n_state)."""
+        shape = x.shape[:-1]
+        states = np.empty((*shape, self.steps, x.shape[-1]))
+        actions = np.empty((*shape, self.steps, self.count))
+        total, alive = np.zeros(shape), np.ones(shape, np.bool_)
+        for t in range(self.steps):
+            u = np.clip(act(x, targets, t), -self.largest, self.largest)
+            states[..., t, :], actions[..., t, :] = x, u
+            x, reward, ended = self.advance(x, u, targets)
             total += np.where(alive, reward, 0.0)
             alive &= ~ended
         if self.tail is not None:
-            total -= self.tail(x.reshape(-1, x.shape[-1])).reshape(n, lines)
-        rows, best = np.arange(n), total.argmax(axis=1)
-        return xs[rows, best], us[rows, best], total[rows, best]
+            total -= self.tail(x.reshape(-1, x.shape[-1])).reshape(shape)
+        return states, actions, total
 
     def _expand(self, states: Array, actions: Array, targets: Array) -> tuple[Array, ...]:
         """Return the model's slopes (n, T, m, n_state), the reward's (n, T, m) and curvature (n, T, m, m).
@@ -266,21 +280,14 @@ class ILQR:
         assert self.tail is not None
         ends = self.advance(states[:, -1], actions[:, -1], targets)[0]
         n, width = ends.shape
-        moves = REACH * np.eye(width)
-
-        def value(move: Array) -> Array:
-            assert self.tail is not None
-            return -self.tail(ends + move)
-
-        plus = np.stack([value(m) for m in moves], axis=1)
-        minus = np.stack([value(-m) for m in moves], axis=1)
-        curvature = np.empty((n, width, width))
-        for a in range(width):
-            for b in range(width):
-                corner = value(moves[a] + moves[b]) - value(moves[a] - moves[b])
-                corner += value(-moves[a] - moves[b]) - value(moves[b] - moves[a])
-                curvature[:, a, b] = corner / (4.0 * REACH**2)
-        return (plus - minus) / (2.0 * REACH), concave(curvature)
+        one = REACH * np.eye(width)
+        a, b = one[:, None], one[None]
+        corners = np.reshape([a + b, a - b, -a - b, b - a], (-1, width))
+        moves = np.concatenate([one, -one, corners])
+        values = np.ascontiguousarray(-self.tail((ends + moves[:, None]).reshape(-1, width)).reshape(-1, n).T)
+        slope = (values[:, :width] - values[:, width : 2 * width]) / (2.0 * REACH)
+        both, first, neither, second = np.moveaxis(values[:, 2 * width :].reshape(n, 4, width, width), 1, 0)
+        return slope, concave(((both - first) + (neither - second)) / (4.0 * REACH**2))
 
     def _solve(
         self, actions: Array, damping: Array, slopes: Array, gradient: Array, curvature: Array,

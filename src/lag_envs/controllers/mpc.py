@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, check_names
-from lag_envs.controllers.ilqr import ILQR, SHARES
+from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names
+from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
+from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.swing_up import away
-from lag_envs.controllers.tracking import waves
+from lag_envs.controllers.tracking import Tracking, smoothed, waves
 from lag_envs.tasks.base import Task
 
 Tail = Callable[[Array], Array]
@@ -31,8 +32,9 @@ class MPC:
     """Plan ahead on the exact model, follow the plan, and plan again every few steps or after a surprise.
 
     A new plan begins with the rest of the old one, followed with its feedback and improved by a few
-    iterations of iLQR. If it still ends badly, as a first plan does, or one after hard kicks, plans are
-    searched for from random guesses. The chance of future kicks is ignored.
+    iterations of iLQR. An episode's first plan begins with the best of recorded ones, improved as much.
+    Without any, or if a plan ends badly, as it may after hard kicks, plans are searched for from random
+    guesses. The chance of future kicks is ignored.
 
     Parameters
     ----------
@@ -42,6 +44,9 @@ class MPC:
         Final cost of a plan, from states (n, n_state) to numbers (n,).
     horizon : int
         Steps to plan ahead.
+    first : sequence of Tracking
+        Recorded plans of the task, from which each episode's first plan is made. With these, nothing is
+        searched for at the start, and all plans are followed by the feedback that `Task.plans` specifies.
     every : int
         Steps after which a plan is renewed.
     iterations : int
@@ -51,7 +56,7 @@ class MPC:
     guesses : int
         Number of guesses that a search improves.
     good : float
-        Final cost below which a plan counts as good. By default there is one search, at the start.
+        Final cost below which a plan counts as good. By default all do, and there is no search but the first.
     pause : int
         Smallest number of steps between searches.
     surprise : float
@@ -72,6 +77,7 @@ class MPC:
         tail: Tail | None = None,
         *,
         horizon: int = 50,
+        first: Sequence[Tracking] = (),
         every: int = 1,
         iterations: int = 2,
         budget: int = 200_000,
@@ -92,13 +98,24 @@ class MPC:
         ):
             if number < 1:
                 raise ValueError(f"{name} must be at least 1, got {number}")
+        if first and task.plans is None:
+            raise ValueError(f"first: {type(task).__name__} has no `plans`, which specify the feedback")
+        for guess in first:
+            if guess.task.scene != task.scene or type(guess.task) is not type(task):
+                raise ValueError(
+                    f"first: a plan for {guess.task.scene} cannot guide {type(task).__name__} with "
+                    f"{task.scene}; take plans that were made for this task, as `recorded(task)` is"
+                )
         self.task, self.horizon, self.every = task, horizon, min(every, horizon)
+        self.first = first
+        self.model = smoothed(task) if first else task
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
         self.largest, self.count = task.formulas.largest, task.formulas.actions
         self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
         calm = without_kicks(task)
-        self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations)
+        gains = None if not first else self._gains
+        self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations, gains=gains)
         self.idle = np.atleast_1d(task.rest_action) + 0.0  # no -0.0
         self.polisher = ILQR(calm, [], tail=tail, steps=horizon, iterations=5 * iterations)
         searched, end = easier or (calm, tail)
@@ -117,9 +134,7 @@ class MPC:
         values = np.asarray(observation)
         x, targets = self.read(values.reshape(-1, values.shape[-1]))
         n, width = x.shape
-        fresh = np.ones(n, np.bool_) if state is None else np.zeros(n, np.bool_)
-        if episode_start is not None:
-            fresh |= np.asarray(episode_start, np.bool_).reshape(n)
+        fresh = beginning(n, state, episode_start)
         if state is None:
             many, blank = (n, self.horizon), np.zeros(n, np.intp)
             acting = np.zeros((*many, self.count)), np.zeros((*many, self.count, width))
@@ -144,8 +159,13 @@ class MPC:
 
     def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
         """Plan again for some of the episodes."""
-        guess = self._continued(plan, rows, x[rows], targets[rows])
-        found, value = self.planner.improve(x[rows], targets[rows], guess)
+        if self.first:
+            begun, rows = rows[fresh[rows]], rows[~fresh[rows]]
+            if len(begun):
+                self._keep(plan, begun, self._begin(x[begun], targets[begun]))
+            if not len(rows):
+                return
+        found, value = self.planner.improve(x[rows], targets[rows], self._following(plan, rows))
         bad = (fresh[rows] | self._ends_badly(found.states, found.actions, targets[rows])) & (
             plan.wait[rows] == 0
         )
@@ -156,27 +176,60 @@ class MPC:
             better = np.flatnonzero(bad)[gain > value[bad]]
             for name in ("states", "actions", "gains"):
                 getattr(found, name)[better] = getattr(other, name)[gain > value[bad]]
+        self._keep(plan, rows, found)
+
+    @staticmethod
+    def _keep(plan: Ahead, rows: NDArray[np.intp], found: Any) -> None:
+        """Store new plans."""
         for name in ("states", "actions", "gains"):
             getattr(plan, name)[rows] = getattr(found, name)
         plan.step[rows] = 0
 
-    def _continued(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array) -> Array:
-        """Return the actions (n, horizon, n_actions) from following plans to their ends and holding there."""
-        actions = np.zeros((len(rows), self.horizon, self.count))
-        for t in range(self.horizon):
+    def _following(self, plan: Ahead, rows: NDArray[np.intp]) -> Feedback:
+        """Return the feedback that follows plans to their ends, and holds there."""
+
+        def act(x: Array, targets: Array, t: int) -> Array:
             step = plan.step[rows] + t
             now = np.minimum(step, self.horizon - 1)
             off = self.read.difference(x, plan.states[rows, now])
             action = plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
-            after = self.idle if self.hold is None else self._holding(x, targets)
-            action = np.where((step < self.horizon)[:, None], action, after)
-            actions[:, t] = action.clip(-self.largest, self.largest)
-            x, _, _ = self.planner.advance(x, actions[:, t], targets)
-        return actions
+            over = (step >= self.horizon)[:, None]
+            if not over.any():
+                return action
+            return np.where(over, self.idle if self.hold is None else self._holding(x, targets), action)
+
+        return act
 
     def _holding(self, x: Array, targets: Array) -> Array:
         """Return the actions (n, n_actions) of the feedback at rest."""
-        return np.reshape(self.hold.act(x, targets, np.full(len(x), np.inf)), (len(x), self.count))
+        return self._tracking(self.hold, x, targets, np.inf)
+
+    def _tracking(self, law: Tracking, x: Array, targets: Array, taken: float) -> Array:
+        """Return the actions (n, n_actions) of a recorded plan after some of its steps."""
+        return np.reshape(law.act(x, targets, np.full(len(x), taken)), (len(x), self.count))
+
+    def _begin(self, x: Array, targets: Array) -> Plan:
+        """Return the best of the plans from recorded ones."""
+        m, pace = len(self.first), self.task.dt / self.task.interval
+
+        def act(x: Array, targets: Array, t: int) -> Array:
+            actions = np.empty((len(x), self.count))
+            for i, law in enumerate(self.first):
+                actions[i::m] = self._tracking(law, x[i::m], targets[i::m], t * pace)
+            return actions
+
+        return self._best(self.planner, x, targets, m, act)
+
+    def _gains(self, states: Array, actions: Array) -> Array:
+        """Return the feedback (n, horizon, n_actions, n_state) along plans: that along recorded ones."""
+        n, width = len(states), states.shape[-1]
+        plans, gains = self.task.plans, np.empty((n, self.horizon, self.count, width))
+        for i in range(n):
+            acted = actions[i, :, 0] if self.count == 1 else actions[i]
+            ended = np.append(states[i], [plans.rest], axis=0)  # the end itself does not matter
+            found, _ = time_varying(self.model, ended, acted, plans.rest, plans.weights, plans.effort)
+            gains[i] = -found.reshape(gains.shape[1:])
+        return gains
 
     def _ends_badly(self, states: Array, actions: Array, targets: Array) -> NDArray[np.bool_]:
         """Return which plans end badly."""
@@ -186,11 +239,16 @@ class MPC:
 
     def _search(self, x: Array, targets: Array) -> tuple[Any, Array]:
         """Return the best of plans from random guesses, and its value."""
-        n, m = len(x), self.guesses
-        guesses = self.largest * waves(self.rng, n * m, self.horizon, self.task.dt, self.count)
-        found, values = self.searcher.improve(np.repeat(x, m, axis=0), np.repeat(targets, m, axis=0), guesses)
-        best = values.reshape(n, m).argmax(axis=1) + m * np.arange(n)
-        return self.polisher.improve(x, targets, self.share * found.actions[best])
+        guesses = waves(self.rng, len(x) * self.guesses, self.horizon, self.task.dt, self.count)
+        found = self._best(self.searcher, x, targets, self.guesses, self.largest * guesses)
+        return self.polisher.improve(x, targets, self.share * found.actions)
+
+    @staticmethod
+    def _best(method: ILQR, x: Array, targets: Array, m: int, guesses: Array | Feedback) -> Plan:
+        """Return for each state the best of the plans that are improved from m guesses for it."""
+        found, values = method.improve(np.repeat(x, m, axis=0), np.repeat(targets, m, axis=0), guesses)
+        best = values.reshape(-1, m).argmax(axis=1) + m * np.arange(len(x))
+        return found._replace(**{name: getattr(found, name)[best] for name in ("states", "actions", "gains")})
 
 
 def planner(

@@ -152,9 +152,13 @@ def hold(task: Task) -> Tracking:
 def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
     """Return the controller that follows states (steps + 1, n_state) and actions, shaped as `Tracking`'s."""
     states, actions = np.asarray(states, np.float64), np.asarray(actions, np.float64)
-    model = remade(task, **plans.smooth) if plans.smooth else task
-    gains, last = time_varying(model, states, actions, plans.rest, plans.weights, plans.effort)
+    gains, last = time_varying(smoothed(task), states, actions, plans.rest, plans.weights, plans.effort)
     return Tracking(task, states=states, actions=actions, gains=gains, rest=plans.rest, hold=last)
+
+
+def smoothed(task: Task) -> Task:
+    """Return the model from which the feedback along a task's plans comes, see `Plans.smooth`."""
+    return remade(task, **task.plans.smooth) if task.plans.smooth else task
 
 
 def waves(rng: np.random.Generator, n: int, steps: int, dt: float, count: int = 1) -> Array:
