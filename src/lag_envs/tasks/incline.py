@@ -375,8 +375,10 @@ class Brake(Task):
     # The decisive reward comes at the line, some hundred steps later.
     hyperparameters = {
         "ppo": {"gamma": 1.0, "gae_lambda": 0.98, "learning_rate": "lin_1e-3"},
+        # In trials with a discount, one seed in five stayed far behind the others.
         "fast_ppo": {
-            "n_timesteps": 1e6, "n_epochs": 5, "reward_scale": 1.0, "episode_share": 1.0, "actor": [64, 64],
+            "n_timesteps": 1e6, "gamma": 1.0, "gae_lambda": 0.98, "learning_rate": 2e-3, "n_epochs": 5,
+            "reward_scale": 1.0, "episode_share": 1.0, "actor": [64, 64],
         },
         # One step's braking changes the return by less than critics err, so several steps count together.
         "off_policy": {
