@@ -538,7 +538,8 @@ class Damping(Task):
 The greedy policy of value iteration is best. The switching line is as good within the uncertainty of these
 episodes: it lets go, and brakes fully as soon as that leads straight to rest. PPO is near rest as much of the
 time as the switching line, but very close to rest for less of it, because its network does not resolve the
-corner of the line. TQC is as good as PPO within the uncertainty, with far fewer steps; SAC and TD3 are worse.
+corner of the line. The PPO in one file, with more steps, is the best learner. TQC is as good as PPO within
+the uncertainty, with far fewer steps; SAC and TD3 are worse.
 """
 
     def check(self) -> None:

@@ -421,9 +421,10 @@ class Brake(Task):
 The switching line is best: roll freely, then brake fully along the curve that meets the line at the right
 speed. It is slightly below the optimum, which may switch in the middle of a step. It beats the greedy policy
 of value iteration, whose grid smears the moment of switching. PPO has found the same strategy, but usually
-crosses a little too early and too fast, which costs more than the time it saves. SAC and TQC get most of the
-way with a fifth of PPO's steps. They need returns over several steps. TD3 gets less far. Unless its actor
-learns much more slowly than its critics, it soon brakes fully everywhere, for good.
+crosses a little too early and too fast, which costs more than the time it saves. The PPO in one file is as
+good, without a discount and with twice the steps. SAC and TQC get most of the way with a fifth of PPO's
+steps. They need returns over several steps. TD3 gets less far. Unless its actor learns much more slowly than
+its critics, it soon brakes fully everywhere, for good.
 """
 
     def check(self) -> None:
