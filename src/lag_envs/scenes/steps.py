@@ -15,7 +15,7 @@ from lag_envs.scenes.checks import (
     StepRefused,
     check_applied,
     check_both,
-    check_controls,
+    check_control,
     check_count,
     check_lags,
     check_parameters,
@@ -107,7 +107,7 @@ def step_bound(
     from lag_envs.stepping.general import StepBound
 
     start, dt = check_state(scene, state), check_step(dt)
-    held = check_controls(scene, control, 1).reshape(-1)
+    held = check_control(scene, control)
     decays, reached = _lagging(scene, lag, applied, dt)
     lagged = decays is not None
     if not lagged and (form := form_of(scene)):
@@ -265,9 +265,7 @@ def energy_balance(
 ) -> dict[str, float]:
     """See `Scene.energy_balance`."""
     dt = check_step(dt)
-    controls = check_controls(scene, control, 1)
-    if controls.ndim != 1:
-        raise ValueError(f"the control must be one set of controls, got shape {controls.shape}")
+    controls = check_control(scene, control)
     points, weights = np.polynomial.legendre.leggauss(check_count("nodes", nodes))
     times = 0.5 * dt * (points + 1.0)
     held: Any = controls[None] if scene.control_names else 1
