@@ -518,8 +518,8 @@ def control_of(acting: Acting, a: Any, xp: Any) -> Any:
 def _numbers_of(where: str, value: Any) -> tuple[float, ...]:
     try:
         return tuple(check_number(where, v) for v in value)
-    except (TypeError, ValueError) as error:
-        raise FormulaError(f"{where}: {error}") from error
+    except ValueError as error:
+        raise FormulaError(str(error)) from error
 
 
 def _mapping(task: Task, name: str) -> dict[str, Any]:
@@ -542,14 +542,11 @@ def _acting(task: Task) -> list[Acting]:
                 raise FormulaError(f"{where} must list at least two values, got {given!r}")
             found.append(Acting(name, min(values), max(values), values))
             continue
-        low, high = (
-            _numbers_of(where, given if isinstance(given, tuple) else (given,))
-            if isinstance(given, tuple)
-            else (-check_number(where, given), check_number(where, given))
-        )
-        if not low < high:
+        pair = _numbers_of(where, given if isinstance(given, tuple) else (given,))
+        pair = pair if isinstance(given, tuple) else (-pair[0], pair[0])
+        if len(pair) != 2 or not pair[0] < pair[1]:
             raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
-        found.append(Acting(name, low, high))
+        found.append(Acting(name, *pair))
     if known and not found:
         raise FormulaError(f"{of}.action must give limits of controls, as in {{{known[0]!r}: 1.0}}")
     return found
