@@ -107,6 +107,33 @@ def test_targets():
     vec = gym.make_vec("OwnCrane-v0", num_envs=2)
     vec.reset(seed=0, options={"target": [[0.1, -1.3], [0.2, -1.4]]})
     np.testing.assert_array_equal(vec.unwrapped.target, [[0.1, -1.3], [0.2, -1.4]])
+    vec.reset(seed=0, options={"target": {"x_goal": 0.3, "y_goal": [-1.3, -1.4]}})
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.3, -1.3], [0.3, -1.4]])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("one", [[0.4, -1.4], np.array([0.4, -1.4]), {"x_goal": 0.4, "y_goal": -1.4}])
+def test_a_target_for_all_of_a_batch(n, one):
+    vec = gym.make_vec("OwnCrane-v0", num_envs=n, target=one)
+    vec.reset(seed=1)
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.4, -1.4]] * n)
+    vec = gym.make_vec("OwnCrane-v0", num_envs=n, target=[[0.4, -1.4]] * n)
+    vec.reset(seed=1)
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.4, -1.4]] * n)
+
+
+@pytest.mark.parametrize("target", [0.5, [0.5], [0.5, 1.0, 2.0], "far", [["a"]], [[0.1], [0.2, 0.3]]])
+def test_bad_targets(target):
+    wanted = (
+        r"target must be 2 numbers \(x_goal, y_goal\), or a mapping of these names, got|real numbers, got"
+    )
+    for make in (gym.make, gym.make_vec):
+        with pytest.raises(ValueError, match=f"{wanted}|one per environment, got"):
+            make("OwnCrane-v0", target=target)
+    vec = gym.make_vec("OwnCrane-v0", num_envs=2)
+    for given in (target, {"x_goal": target}, {"x_goal": target, "y_goal": [0.1, 0.2, 0.3]}):
+        with pytest.raises(ValueError, match=r"options\['target'\]|target must give x_goal, y_goal, got"):
+            vec.reset(options={"target": given})
 
 
 def test_reward_scales_with_dt():

@@ -432,14 +432,17 @@ class Task:
         if not names:
             raise ValueError(f"this task has no target, got target={target!r}")
         if isinstance(target, Mapping):
-            if sorted(target) != sorted(names):
+            if set(target) != set(names):
                 raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
             target = [target[name] for name in names]
         elif len(names) == 1:
             return check_number("target", target)
         array = np.atleast_1d(real_array("target", target))
         if array.shape != (len(names),):
-            raise ValueError(f"target must be {', '.join(names)}, got {target!r}")
+            raise ValueError(
+                f"target must be {len(names)} numbers ({', '.join(names)}), or a mapping of these names, "
+                f"got {target!r}"
+            )
         for name, value in zip(names, array, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"target {name} must be finite, got {value}")
