@@ -133,7 +133,10 @@ UNTRACEABLE = {
         "potential; power; xp.exp(p * xp.log(x))",
     ),
     "recorded power": ({"potential": lambda self, q, xp: q.x**self.spring}, "potential; power"),
-    "recorded exponent": ({"potential": lambda self, q, xp: 2.0**q.x}, "potential; power; xp.exp"),
+    "recorded exponent": (
+        {"potential": lambda self, q, xp: 2.0**q.x},
+        "potential; power; xp.exp(x * xp.log(2.0))",
+    ),
     "count by a parameter": (
         {"potential": lambda self, q, xp: sum(q.x**2 for _ in range(self.spring))},
         "potential; index or range; structural",
@@ -160,6 +163,10 @@ UNTRACEABLE = {
         "applied; 'push'; force",
     ),
     "unknown parameter": ({"potential": lambda self, q, xp: self.width * q.x**2}, "potential; 'width'"),
+    "misspelt parameter": (
+        {"potential": lambda self, q, xp: self.sprng * q.x**2},
+        "potential; 'sprng'; did you mean spring?",
+    ),
     "derived from itself": (
         {"potential": lambda self, q, xp: self.energy([0.0] * 6)["total"]},
         "potential; derived",

@@ -1,6 +1,7 @@
 """Scenes and tasks outside the package: written by name, with everything that the package's own have."""
 
 import copy
+import math
 import pickle
 import warnings
 from pathlib import Path
@@ -257,6 +258,16 @@ def _mistaken(**changes):
         ),
         ({"reward": 0.0}, r"Mistaken.reward must be reward\(self, before, .*, got 0.0"),
         ({"reward": lambda self, b, after, *a: a[-1].clip(after.x, 0, 1)}, "it uses xp.clip; .* minimum"),
+        ({"reward": lambda self, b, after, *_: math.exp(after.x)}, "write xp.exp for math.exp"),
+        ({"reward": lambda self, b, after, *_: np.exp(after.x)}, "write xp.exp"),
+        ({"reward": lambda self, *_: self.scene.load_mas}, "no attribute 'load_mas'; did you mean load_mass"),
+        (
+            {"reward": lambda self, *_: self.scene.brake},
+            "no attribute 'brake'; it has trolley_mass, load_mass",
+        ),
+        ({"reward": lambda self, *_: self.scne.load_mass}, "no attribute 'scne'; did you mean scene"),
+        ({"kick": lambda self, after, draws, xp: {"x": draws[2]}}, "no random draw number 2, only 2 of them"),
+        ({"reward": lambda self, b, after, *_: [after.x]}, "returns a list; it must return a number"),
         ({"reward": lambda self, b, after, *_: 1.0 if after.x > 0 else 0.0}, "branch"),
         ({"terminated": lambda self, after, target, xp: after.x > 1 and after.x < 2}, "branch"),
         ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),
@@ -280,7 +291,7 @@ def _mistaken(**changes):
         ),
         (
             {"reward": lambda self, b, after, *_: np.array([after.x])},
-            "reward returns array.* return a number",
+            "reward returns an array; it must return a number",
         ),
         (
             {"reward": lambda self, *_: np.random.default_rng().random()},

@@ -342,7 +342,8 @@ class TaskFormulas:
 
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
         """Return the state after a kick."""
-        added = self._call("kick", k, self.named_state(z), draws, self._known(xp, z))
+        drawn = Values("random draw", {str(i): draw for i, draw in enumerate(draws)})
+        added = self._call("kick", k, self.named_state(z), drawn, self._known(xp, z))
         if not isinstance(added, Mapping):
             self._refuse("kick", added, "changes of the state's entries by name")
         after = dict(zip(self.state, z, strict=False))
@@ -404,7 +405,8 @@ class TaskFormulas:
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
 
     def _refuse(self, name: str, found: Any, wanted: str) -> NoReturn:
-        got = "a number" if isinstance(found, TracedNumber) else f"{found!r:.60}"
+        kinds = {TracedNumber: "a number", np.ndarray: "an array", list: "a list", tuple: "a tuple"}
+        got = kinds.get(type(found)) or f"{found!r:.60}"
         raise FormulaError(f"{type(self._task).__name__}.{name} returns {got}; it must return {wanted}")
 
     def sample_targets(self, draws: Sequence, k: Any) -> list:
