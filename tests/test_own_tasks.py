@@ -169,23 +169,49 @@ def test_bad_actions(action):
 
 
 # Without rope the mass matrix is singular: at the start, or after some substeps.
-@pytest.mark.parametrize("wild", [[0, 0, 0, 0, 0.3, 1], [0, 0, 0.2, -10, 0, 0]])
-def test_refused_step_keeps_the_state(wild):
+@pytest.mark.parametrize(
+    ("wild", "why"),
+    [
+        (
+            [0, 0, 0, 0, 0.3, 1],
+            "the mass matrix of x, rope, swing is not positive definite there; choose other",
+        ),
+        ([0, 0, 0.2, -10, 0, 0], "take a smaller dt .* near a singular configuration, other coordinates"),
+    ],
+)
+def test_refused_step_keeps_the_state(wild, why):
     env = gym.make("OwnCrane-v0").unwrapped
     env.reset(seed=0, options={"state": wild})
     before = env.state
-    with pytest.raises(StepRefused):
+    with pytest.raises(StepRefused, match=why):
         env.step(np.zeros(2, np.float32))
     np.testing.assert_array_equal(env.state, before)
     vec = gym.make_vec("OwnCrane-v0", num_envs=3)
     calm = [0, 0, 1, 0, 0.1, 0]
     vec.reset(seed=0, options={"state": [calm, wild, calm]})
-    with pytest.raises(StepRefused) as refusal:
+    with pytest.raises(StepRefused, match=why) as refusal:
         vec.step(np.zeros((3, 2), np.float32))
     states = vec.unwrapped.state
     np.testing.assert_array_equal(states[1], wild)
     np.testing.assert_array_equal(states[0], env.scene.simulate(calm, [vec.unwrapped.control[0]], 0.05)[1])
     assert np.isfinite(refusal.value.results[1][[0, 2]]).all()
+
+
+@pytest.mark.parametrize("place", [0.0, -1.0])
+def test_refusal_where_a_formula_has_no_value(place):
+    class Uphill(Scene):
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return xp.sqrt(q.x)
+
+    with pytest.raises(
+        StepRefused, match="the acceleration there is not finite; .* end or reset the episode"
+    ):
+        Uphill().simulate([place, 0.0], 1, 0.02)
 
 
 @pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])

@@ -34,6 +34,7 @@ from lag_envs.scenes.derivation import (
     series_order_of,
     step_argument_of,
 )
+from lag_envs.scenes.door import SINGULAR, smallest_eigenvalue
 from lag_envs.stepping.elementary import LARGEST_ANGLE
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -293,20 +294,33 @@ def refusal(
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
     values = np.atleast_1d(np.asarray(control, dtype=np.float64))
     held = zip(scene.control_names, values, strict=True)
-    why = "it could not be certified within the largest number of substeps"
-    remedy = "take a smaller dt or milder parameters"
-    if form_of(scene) is not None and not lagged:
-        why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
+    why = "it could not be certified within the largest number of substeps, or has no finite result"
+    remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
+    if singular := _singular(scene, state, values):
+        why, remedy = singular, "choose other coordinates, or end or reset the episode before"
+    elif form_of(scene) is not None and not lagged:
+        why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
+        remedy = "take a smaller dt or milder parameters"
     elif far := _far_angles(scene, state, values):
         why = f"it needs sine and cosine of {far}, which are not computed beyond {LARGEST_ANGLE:g} rad"
         remedy = f"subtract whole turns from {far}"
     error = StepRefused(
         f"{where} was refused: from ({start}) with "
-        f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}, or has no "
-        f"finite result; {remedy}"
+        f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}; {remedy}"
     )
     error.trajectory = None if trajectory is None else trajectory.copy()
     return error
+
+
+def _singular(scene: Scene, state: Array, control: Array) -> str:
+    """Return why there is no motion from a state, or nothing."""
+    if not np.isfinite(state).all():
+        return "the state is not finite"
+    mass = scene.mass_matrix(state, control)
+    if np.isfinite(mass).all() and smallest_eigenvalue(mass) < SINGULAR:
+        return f"the mass matrix of {', '.join(layout_of(scene).free)} is not positive definite there"
+    finite = np.isfinite(mass).all() and np.isfinite([*scene.acceleration(state, control).values()]).all()
+    return "" if finite else "the acceleration there is not finite"
 
 
 def _far_angles(scene: Scene, state: Array, control: Array) -> str:
