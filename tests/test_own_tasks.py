@@ -305,6 +305,15 @@ def _mistaken(**changes):
         ({"target": {"x_goal": ("m", -1.0)}}, r"target\['x_goal'\]: a half width must not be negative"),
         ({"defaults": {"load_mas": 1.0}}, "Mistaken.defaults: .*'load_mas'; did you mean load_mass?"),
         ({"usable": {"load_mas": (0.0, 1.0)}}, "Mistaken.usable: .*'load_mas'; did you mean load_mass?"),
+        (
+            {"usable": {"load_mass": (1.0, 0.1)}},
+            r"usable\['load_mass'\] must be .*, in this order, got \(1.0, 0.1",
+        ),
+        ({"interval": 0.0}, "Mistaken.interval must lie between 1e-6 and 1 s, got 0 s"),
+        (
+            {"steps": 0},
+            r"duration \(Mistaken.steps \* Mistaken.interval\) must be at least dt=0.05 s, got 0 s",
+        ),
         ({"interval": "short"}, "Mistaken.interval must be a real number"),
         ({"steps": 50.5}, "Mistaken.steps must be a whole number, or infinity for no end, got 50.5"),
         ({"draws": 1.5}, "Mistaken.draws must be a whole number, 0 or more, got 1.5"),
@@ -465,11 +474,14 @@ def test_order_of_a_task():
             type("Wrong", (own_tasks.Deliver,), {"order": order})()
 
 
-def test_unknown_keyword():
-    with pytest.raises(
-        TypeError, match="unexpected keyword argument 'wind'; this environment takes gravity, load_mass"
-    ):
-        gym.make("OwnCrane-v0", wind=1.0)
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("wind", ""), ("lod_mass", "did you mean load_mass"), ("num_envs", "gym.make_vec makes many; ")],
+)
+def test_unknown_keyword(name, meant):
+    takes = "this environment takes gravity, load_mass, .*, target, .*, render_mode, diagnostics"
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'; {meant}.*{takes}"):
+        gym.make("OwnCrane-v0", **{name: 1.0})
 
 
 def test_example(monkeypatch):
