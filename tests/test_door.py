@@ -574,7 +574,7 @@ def test_limits_that_no_parameter_meets(limits, words):
 
 
 def test_unknown_parameter():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'massa'; did you mean mass?"):
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'massa'; did you mean mass\?"):
         Good(massa=1.0)
     with pytest.raises(
         TypeError, match="unexpected keyword argument 'qqq'; there are mass, spring, friction"

@@ -123,6 +123,23 @@ def test_a_target_for_all_of_a_batch(n, one):
     np.testing.assert_array_equal(vec.unwrapped.target, [[0.4, -1.4]] * n)
 
 
+def test_a_start_from_which_the_episode_would_be_over():
+    over, good = [2.5, 0, 1, 0, 0, 0], [0, 0, 1, 0, 0, 0]
+    env, vec = gym.make("OwnCrane-v0").unwrapped, gym.make_vec("OwnCrane-v0", num_envs=2).unwrapped
+    wanted = "the episode would be over at x=2.5, x_dot=0, rope=1, "
+    with pytest.raises(ValueError, match=wanted):
+        env.reset(options={"state": over})
+    with pytest.raises(ValueError, match=f"environment 1: {wanted}"):
+        vec.reset(options={"state": [good, over]})
+    # Whether this one is over depends on the target, which the first step knows.
+    near = _mistaken(terminated=lambda self, after, target, xp: xp.abs(after.x - target.x_goal) > 1.0)()
+    np.testing.assert_array_equal(near.start_state(over), over)
+    inside = _mistaken(terminated=lambda self, after, target, xp: ~(xp.abs(after.x) < 2.0))()
+    np.testing.assert_array_equal(inside.start_state(good), good)
+    with pytest.raises(ValueError, match=wanted):
+        inside.start_state(over)
+
+
 @pytest.mark.parametrize("target", [0.5, [0.5], [0.5, 1.0, 2.0], "far", [["a"]], [[0.1], [0.2, 0.3]]])
 def test_bad_targets(target):
     wanted = (
@@ -180,13 +197,19 @@ def test_bad_actions(action):
     ],
 )
 def test_refused_step_keeps_the_state(wild, why):
-    env = gym.make("OwnCrane-v0").unwrapped
+    class Slack(own_tasks.Deliver):
+        id = "OwnSlack-v0"
+
+        def terminated(self, after, target, xp):
+            return xp.abs(after.x) > 2.0
+
+    env = gym.make(lag_envs.register(Slack)).unwrapped
     env.reset(seed=0, options={"state": wild})
     before = env.state
     with pytest.raises(StepRefused, match=why):
         env.step(np.zeros(2, np.float32))
     np.testing.assert_array_equal(env.state, before)
-    vec = gym.make_vec("OwnCrane-v0", num_envs=3)
+    vec = gym.make_vec(Slack.id, num_envs=3)
     calm = [0, 0, 1, 0, 0.1, 0]
     vec.reset(seed=0, options={"state": [calm, wild, calm]})
     with pytest.raises(StepRefused, match=why) as refusal:
@@ -209,7 +232,7 @@ def test_refusal_where_a_formula_has_no_value(place):
             return xp.sqrt(q.x)
 
     with pytest.raises(
-        StepRefused, match="the acceleration there is not finite; .* end or reset the episode"
+        StepRefused, match=r"the acceleration there is not finite; .* end or reset the episode"
     ):
         Uphill().simulate([place, 0.0], 1, 0.02)
 

@@ -189,7 +189,7 @@ def _remedy(of: Any, error: Exception) -> str:
         return "use + - * /, whole powers and functions of xp"
     fields = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
     otherwise = f"it has {', '.join(fields)}" if fields else "define it in the class"
-    return hint(error.name, [name for name in dir(owner) if not name.startswith("_")], otherwise)
+    return hint(str(error.name), [name for name in dir(owner) if not name.startswith("_")], otherwise)
 
 
 def check_signature(scene: Any, name: str) -> None:

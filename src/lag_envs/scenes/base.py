@@ -57,7 +57,7 @@ class SceneType(ABCMeta):
         try:
             scene = super().__call__(*args, **keywords)
         except TypeError as error:
-            fields = [field.name for field in dataclasses.fields(cls) if field.init]
+            fields = [field.name for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
             unknown = [name for name in keywords if name not in fields]
             if not unknown:
                 raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import math
@@ -268,7 +269,17 @@ class Task:
         """Raise ValueError if the parameters do not fit the task."""
 
     def check_start(self, state: Any) -> None:
-        """Raise ValueError for an impossible start; `state` is accessed by name or by index."""
+        """Raise ValueError for an impossible start: by default, one at which the episode would be over.
+
+        `state` is accessed by name or by index.
+        """
+        numbers, ended = np.array([*state]), False
+        # An ending that depends on the target is left to the first step.
+        with contextlib.suppress(AttributeError, TypeError), np.errstate(all="ignore"):
+            ended = bool(self.terminated(self.formulas.named_state([*numbers]), None, np))
+        if ended:
+            given = ", ".join(f"{n}={x:g}" for n, x in zip(self.scene.state_names, numbers, strict=True))
+            raise ValueError(f"the episode would be over at {given}; give a state where it goes on")
 
     @property
     def fastest(self) -> float:
