@@ -296,14 +296,14 @@ def refusal(
     held = zip(scene.control_names, values, strict=True)
     why = "it could not be certified within the largest number of substeps, or has no finite result"
     remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
-    if singular := _singular(scene, state, values):
-        why, remedy = singular, "choose other coordinates, or end or reset the episode before"
-    elif form_of(scene) is not None and not lagged:
+    if form_of(scene) is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
         remedy = "take a smaller dt or milder parameters"
     elif far := _far_angles(scene, state, values):
         why = f"it needs sine and cosine of {far}, which are not computed beyond {LARGEST_ANGLE:g} rad"
         remedy = f"subtract whole turns from {far}"
+    elif singular := _singular(scene, state, values):
+        why, remedy = singular, "choose other coordinates, or end or reset the episode before"
     error = StepRefused(
         f"{where} was refused: from ({start}) with "
         f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}; {remedy}"
