@@ -232,6 +232,19 @@ def test_refusal_where_a_formula_has_no_value(place):
         Uphill().simulate([place, 0.0], 1, 0.02)
 
 
+@pytest.mark.parametrize("kind", [own_tasks.Deliver, pivoted_bar.SwingUp])
+def test_refusal_after_a_kick_that_is_no_number(kind):
+    def kick(self, after, draws, xp):
+        return {self.scene.state_names[-1]: xp.log(draws[0] - 2.0)}
+
+    torn = {"id": "OwnTorn-v0", "draws": 1, "kick": kick, "terminated": Task.terminated}
+    env = gym.make(lag_envs.register(type("Torn", (kind,), torn)), disable_env_checker=True)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    with pytest.raises(StepRefused, match="the state is not finite; reset the episode"):
+        env.step(env.action_space.sample())
+
+
 @pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
 @pytest.mark.parametrize("id", IDS)
 def test_copies_go_on_alike(id, dump):

@@ -296,7 +296,9 @@ def refusal(
     held = zip(scene.control_names, values, strict=True)
     why = "it could not be certified within the largest number of substeps, or has no finite result"
     remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
-    if form_of(scene) is not None and not lagged:
+    if not np.isfinite(state).all():
+        why, remedy = "the state is not finite", "reset the episode; if the task has a kick, look there"
+    elif form_of(scene) is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
         remedy = "take a smaller dt or milder parameters"
     elif far := _far_angles(scene, state, values):
@@ -314,8 +316,6 @@ def refusal(
 
 def _singular(scene: Scene, state: Array, control: Array) -> str:
     """Return why there is no motion from a state, or nothing."""
-    if not np.isfinite(state).all():
-        return "the state is not finite"
     mass = scene.mass_matrix(state, control)
     if np.isfinite(mass).all() and smallest_eigenvalue(mass) < SINGULAR:
         return f"the mass matrix of {', '.join(layout_of(scene).free)} is not positive definite there"
