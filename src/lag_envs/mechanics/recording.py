@@ -81,7 +81,7 @@ class Values:
             return values[index]
         except IndexError:
             raise FormulaError(
-                f"there is no {self._what} number {index}, only {len(values)} of them"
+                f"there is no {self._what} number {index}, only {len(values)} of them, counted from 0"
             ) from None
 
     def __iter__(self) -> Iterator[Any]:
