@@ -297,7 +297,7 @@ def test_play_tells_return_and_score(window, capsys, monkeypatch):
     assert re.fullmatch(
         r"time is up: return -?[\d.e-]+, score -?[\d.]+ \(0 is random, 1 the best known\)", first
     )
-    assert re.fullmatch(r"interrupted: return \S+", second)
+    assert re.fullmatch(r"after 15 steps: return \S+", second)
 
 
 def test_sticks_become_actions():

@@ -133,7 +133,10 @@ UNTRACEABLE = {
         "potential; power; xp.exp(p * xp.log(x))",
     ),
     "recorded power": ({"potential": lambda self, q, xp: q.x**self.spring}, "potential; power"),
-    "recorded exponent": ({"potential": lambda self, q, xp: 2.0**q.x}, "potential; power; xp.exp"),
+    "recorded exponent": (
+        {"potential": lambda self, q, xp: 2.0**q.x},
+        "potential; power; xp.exp(x * xp.log(2.0))",
+    ),
     "count by a parameter": (
         {"potential": lambda self, q, xp: sum(q.x**2 for _ in range(self.spring))},
         "potential; index or range; structural",
@@ -160,6 +163,10 @@ UNTRACEABLE = {
         "applied; 'push'; force",
     ),
     "unknown parameter": ({"potential": lambda self, q, xp: self.width * q.x**2}, "potential; 'width'"),
+    "misspelt parameter": (
+        {"potential": lambda self, q, xp: self.sprng * q.x**2},
+        "potential; 'sprng'; did you mean spring?",
+    ),
     "derived from itself": (
         {"potential": lambda self, q, xp: self.energy([0.0] * 6)["total"]},
         "potential; derived",
@@ -420,6 +427,14 @@ def parameter_named_like_a_formula():
     return Bad
 
 
+@mistake("width has no annotation", "width: float = parameter(...)")
+def parameter_without_annotation():
+    class Bad(Good):
+        width = parameter(1.0, "m")
+
+    return Bad
+
+
 @mistake("left_out", "depends on 's'")
 def left_out_that_is_needed():
     class Bad(Good):
@@ -541,6 +556,30 @@ def test_what_is_refused_is_a_type_error_and_a_value_error():
 def test_unit_of_a_parameter():
     with pytest.raises(FormulaError, match="the unit of a parameter must be text, got 3"):
         parameter(1.0, 3)
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"above": 3.0, "below": 2.0}, "no parameter is above 3 and below 2"),
+        ({"least": 3.0, "below": 3.0}, "no parameter is at least 3 and below 3"),
+        ({"least": 3.0, "most": 2.0}, "no parameter is at least 3 and at most 2"),
+        ({"usable": (2.0, 1.0)}, r"usable must be (lowest, highest), in this order, got (2.0, 1.0)"),
+    ],
+)
+def test_limits_that_no_parameter_meets(limits, words):
+    with pytest.raises(FormulaError, match=re.escape(words)):
+        parameter(2.5, "m", **limits)
+    parameter(3.0, "m", least=3.0, most=3.0)
+
+
+def test_unknown_parameter():
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'massa'; did you mean mass\?"):
+        Good(massa=1.0)
+    with pytest.raises(
+        TypeError, match="unexpected keyword argument 'qqq'; there are mass, spring, friction"
+    ):
+        Good(qqq=1.0)
 
 
 @pytest.mark.parametrize(

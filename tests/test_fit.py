@@ -372,7 +372,7 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
     [
         ([], {}, "recordings must be a list of .states, controls, dt."),
         ([(STATES, None)], {}, r"recording 0 must be \(states, controls, dt\)"),
-        ((STATES, None, DT), {}, "recording 0 must be"),
+        ((STATES, None, DT), {}, r"a list of \(states, controls, dt\), got one; put it into a list$"),
         ([(STATES[:, :1], None, DT)], {}, r"recording 0: states must have shape \(N, 2\), .* got \(20, 1\)"),
         ([(STATES[:1], None, DT)], {}, "at least two states, got 1"),
         ([(STATES * np.nan, None, DT)], {}, "nothing was measured"),

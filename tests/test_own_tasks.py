@@ -1,6 +1,7 @@
 """Scenes and tasks outside the package: written by name, with everything that the package's own have."""
 
 import copy
+import math
 import pickle
 import warnings
 from pathlib import Path
@@ -107,6 +108,50 @@ def test_targets():
     vec = gym.make_vec("OwnCrane-v0", num_envs=2)
     vec.reset(seed=0, options={"target": [[0.1, -1.3], [0.2, -1.4]]})
     np.testing.assert_array_equal(vec.unwrapped.target, [[0.1, -1.3], [0.2, -1.4]])
+    vec.reset(seed=0, options={"target": {"x_goal": 0.3, "y_goal": [-1.3, -1.4]}})
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.3, -1.3], [0.3, -1.4]])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("one", [[0.4, -1.4], np.array([0.4, -1.4]), {"x_goal": 0.4, "y_goal": -1.4}])
+def test_a_target_for_all_of_a_batch(n, one):
+    vec = gym.make_vec("OwnCrane-v0", num_envs=n, target=one)
+    vec.reset(seed=1)
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.4, -1.4]] * n)
+    vec = gym.make_vec("OwnCrane-v0", num_envs=n, target=[[0.4, -1.4]] * n)
+    vec.reset(seed=1)
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.4, -1.4]] * n)
+
+
+def test_a_start_from_which_the_episode_would_be_over():
+    over, good = [2.5, 0, 1, 0, 0, 0], [0, 0, 1, 0, 0, 0]
+    env, vec = gym.make("OwnCrane-v0").unwrapped, gym.make_vec("OwnCrane-v0", num_envs=2).unwrapped
+    wanted = "the episode would be over at x=2.5, x_dot=0, rope=1, "
+    with pytest.raises(ValueError, match=wanted):
+        env.reset(options={"state": over})
+    with pytest.raises(ValueError, match=f"environment 1: {wanted}"):
+        vec.reset(options={"state": [good, over]})
+    # Whether this one is over depends on the target, which the first step knows.
+    near = _mistaken(terminated=lambda self, after, target, xp: xp.abs(after.x - target.x_goal) > 1.0)()
+    np.testing.assert_array_equal(near.start_state(over), over)
+    inside = _mistaken(terminated=lambda self, after, target, xp: ~(xp.abs(after.x) < 2.0))()
+    np.testing.assert_array_equal(inside.start_state(good), good)
+    with pytest.raises(ValueError, match=wanted):
+        inside.start_state(over)
+
+
+@pytest.mark.parametrize("target", [0.5, [0.5], [0.5, 1.0, 2.0], "far", [["a"]], [[0.1], [0.2, 0.3]]])
+def test_bad_targets(target):
+    wanted = (
+        r"target must be 2 numbers \(x_goal, y_goal\), or a mapping of these names, got|real numbers, got"
+    )
+    for make in (gym.make, gym.make_vec):
+        with pytest.raises(ValueError, match=f"{wanted}|one per environment, got"):
+            make("OwnCrane-v0", target=target)
+    vec = gym.make_vec("OwnCrane-v0", num_envs=2)
+    for given in (target, {"x_goal": target}, {"x_goal": target, "y_goal": [0.1, 0.2, 0.3]}):
+        with pytest.raises(ValueError, match=r"options\['target'\]|target must give x_goal, y_goal, got"):
+            vec.reset(options={"target": given})
 
 
 def test_reward_scales_with_dt():
@@ -141,23 +186,63 @@ def test_bad_actions(action):
 
 
 # Without rope the mass matrix is singular: at the start, or after some substeps.
-@pytest.mark.parametrize("wild", [[0, 0, 0, 0, 0.3, 1], [0, 0, 0.2, -10, 0, 0]])
-def test_refused_step_keeps_the_state(wild):
-    env = gym.make("OwnCrane-v0").unwrapped
+@pytest.mark.parametrize(
+    ("wild", "why"),
+    [
+        (
+            [0, 0, 0, 0, 0.3, 1],
+            "the mass matrix of x, rope, swing is not positive definite there; choose other",
+        ),
+        ([0, 0, 0.2, -10, 0, 0], "take a smaller dt .* near a singular configuration, other coordinates"),
+    ],
+)
+def test_refused_step_keeps_the_state(wild, why):
+    Slack = type("Slack", (own_tasks.Deliver,), {"id": "OwnSlack-v0", "terminated": Task.terminated})
+    env = gym.make(lag_envs.register(Slack)).unwrapped
     env.reset(seed=0, options={"state": wild})
     before = env.state
-    with pytest.raises(StepRefused):
+    with pytest.raises(StepRefused, match=why):
         env.step(np.zeros(2, np.float32))
     np.testing.assert_array_equal(env.state, before)
-    vec = gym.make_vec("OwnCrane-v0", num_envs=3)
+    vec = gym.make_vec(Slack.id, num_envs=3)
     calm = [0, 0, 1, 0, 0.1, 0]
     vec.reset(seed=0, options={"state": [calm, wild, calm]})
-    with pytest.raises(StepRefused) as refusal:
+    with pytest.raises(StepRefused, match=why) as refusal:
         vec.step(np.zeros((3, 2), np.float32))
     states = vec.unwrapped.state
     np.testing.assert_array_equal(states[1], wild)
     np.testing.assert_array_equal(states[0], env.scene.simulate(calm, [vec.unwrapped.control[0]], 0.05)[1])
     assert np.isfinite(refusal.value.results[1][[0, 2]]).all()
+
+
+@pytest.mark.parametrize("place", [0.0, -1.0])
+def test_refusal_where_a_formula_has_no_value(place):
+    class Uphill(Scene):
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return xp.sqrt(q.x)
+
+    with pytest.raises(
+        StepRefused, match=r"the acceleration there is not finite; .* end or reset the episode"
+    ):
+        Uphill().simulate([place, 0.0], 1, 0.02)
+
+
+@pytest.mark.parametrize("kind", [own_tasks.Deliver, pivoted_bar.SwingUp])
+def test_refusal_after_a_kick_that_is_no_number(kind):
+    def kick(self, after, draws, xp):
+        return {self.scene.state_names[-1]: xp.log(draws[0] - 2.0)}
+
+    torn = {"id": "OwnTorn-v0", "draws": 1, "kick": kick, "terminated": Task.terminated}
+    env = gym.make(lag_envs.register(type("Torn", (kind,), torn)), disable_env_checker=True)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    with pytest.raises(StepRefused, match="the state is not finite; reset the episode"):
+        env.step(env.action_space.sample())
 
 
 @pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
@@ -210,10 +295,16 @@ def _mistaken(**changes):
         ({"action": {"shove": 1.0}}, r"action\['shove'\]: the scene has no such control, only push, pull"),
         ({"action": {}}, "Mistaken.action must give limits"),
         ({"action": {"push": 0.0, "pull": 1.0}}, "limit above 0"),
+        (
+            {"action": {"push": (1.0, 2.0, 3.0), "pull": 1.0}},
+            r"action\['push'\] must be a limit above 0 or \(low",
+        ),
+        ({"action": {"push": (1.0,), "pull": 1.0}}, "limit above 0"),
+        ({"action": {"push": "far", "pull": 1.0}}, r"^Mistaken.action\['push'\] must be a real number"),
         ({"action": {"push": [1.0, 2.0], "pull": 1.0}}, "mixes lists of values with ranges"),
         ({"action": {"push": [1.0]}}, "at least two values"),
         ({"start": {"y": 0.1}}, r"start\['y'\]: the state has no such entry, only x, x_dot"),
-        ({"start": {"x": "far"}}, "real number"),
+        ({"start": {"x": "far"}}, r"^Mistaken.start\['x'\] must be a real number, got 'far'"),
         ({"target": {"x_goal": 0.3}}, r"target\['x_goal'\] must be \(unit, half width\)"),
         ({"observe": lambda self, after, target, xp: [after.x]}, "observe must return numbers by name"),
         ({"observe": lambda self, after, target, xp: {"x": after.y}}, "there is no entry of the state 'y'"),
@@ -224,6 +315,16 @@ def _mistaken(**changes):
         ),
         ({"reward": 0.0}, r"Mistaken.reward must be reward\(self, before, .*, got 0.0"),
         ({"reward": lambda self, b, after, *a: a[-1].clip(after.x, 0, 1)}, "it uses xp.clip; .* minimum"),
+        ({"reward": lambda self, b, after, *_: math.exp(after.x)}, "write xp.exp for math.exp"),
+        ({"reward": lambda self, b, after, *_: np.exp(after.x)}, "write xp.exp"),
+        ({"reward": lambda self, *_: self.scene.load_mas}, "no attribute 'load_mas'; did you mean load_mass"),
+        (
+            {"reward": lambda self, *_: self.scene.brake},
+            "no attribute 'brake'; it has trolley_mass, load_mass",
+        ),
+        ({"reward": lambda self, *_: self.scne.load_mass}, "no attribute 'scne'; did you mean scene"),
+        ({"kick": lambda self, after, draws, xp: {"x": draws[2]}}, "no random draw number 2, only 2 of them"),
+        ({"reward": lambda self, b, after, *_: [after.x]}, "returns a list; it must return a number"),
         ({"reward": lambda self, b, after, *_: 1.0 if after.x > 0 else 0.0}, "branch"),
         ({"terminated": lambda self, after, target, xp: after.x > 1 and after.x < 2}, "branch"),
         ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),
@@ -235,6 +336,15 @@ def _mistaken(**changes):
         ({"target": {"x_goal": ("m", -1.0)}}, r"target\['x_goal'\]: a half width must not be negative"),
         ({"defaults": {"load_mas": 1.0}}, "Mistaken.defaults: .*'load_mas'; did you mean load_mass?"),
         ({"usable": {"load_mas": (0.0, 1.0)}}, "Mistaken.usable: .*'load_mas'; did you mean load_mass?"),
+        (
+            {"usable": {"load_mass": (1.0, 0.1)}},
+            r"usable\['load_mass'\] must be .*, in this order, got \(1.0, 0.1",
+        ),
+        ({"interval": 0.0}, "Mistaken.interval must lie between 1e-6 and 1 s, got 0 s"),
+        (
+            {"steps": 0},
+            r"duration \(Mistaken.steps \* Mistaken.interval\) must be at least dt=0.05 s, got 0 s",
+        ),
         ({"interval": "short"}, "Mistaken.interval must be a real number"),
         ({"steps": 50.5}, "Mistaken.steps must be a whole number, or infinity for no end, got 50.5"),
         ({"draws": 1.5}, "Mistaken.draws must be a whole number, 0 or more, got 1.5"),
@@ -247,7 +357,7 @@ def _mistaken(**changes):
         ),
         (
             {"reward": lambda self, b, after, *_: np.array([after.x])},
-            "reward returns array.* return a number",
+            "reward returns an array; it must return a number",
         ),
         (
             {"reward": lambda self, *_: np.random.default_rng().random()},
@@ -395,11 +505,14 @@ def test_order_of_a_task():
             type("Wrong", (own_tasks.Deliver,), {"order": order})()
 
 
-def test_unknown_keyword():
-    with pytest.raises(
-        TypeError, match="unexpected keyword argument 'wind'; this environment takes gravity, load_mass"
-    ):
-        gym.make("OwnCrane-v0", wind=1.0)
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("wind", ""), ("lod_mass", "did you mean load_mass"), ("num_envs", "gym.make_vec makes many; ")],
+)
+def test_unknown_keyword(name, meant):
+    takes = "this environment takes gravity, load_mass, .*, target, .*, render_mode, diagnostics"
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'; {meant}.*{takes}"):
+        gym.make("OwnCrane-v0", **{name: 1.0})
 
 
 def test_example(monkeypatch):

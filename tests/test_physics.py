@@ -14,7 +14,7 @@ from sympy import cos, sin
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report.closed_forms import linear
-from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
+from lag_envs.scenes import Chain, CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.symbolic import symbolic, t
 
 U = sympy.Symbol("u", real=True)
@@ -410,3 +410,6 @@ def test_step_bound():
     for state, u, dt in (([0.0] * 3, 0.0, 0.02), ([0.0] * 4, math.nan, 0.02), ([0.0] * 4, 0.0, 0.0)):
         with pytest.raises(ValueError, match="must be"):
             bar.step_bound(state, u, dt)
+    for bound in (bar.step_bound, bar.truncation_bound, Chain(bars=2).step_bound):
+        with pytest.raises(ValueError, match=r"one set of controls, got shape \(2, 1\)"):
+            bound([0.0] * len(bound.__self__.state_names), [1.0, 2.0], 0.02)

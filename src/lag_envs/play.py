@@ -179,7 +179,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None, **option
                     time.sleep(0.5)
                 env.reset()
         if begun:
-            tell("interrupted", whole=False)
+            tell(f"after {steps} steps" if taken == steps else "interrupted", whole=False)
     finally:
         pad.close()
         env.close()

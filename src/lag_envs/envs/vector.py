@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -39,6 +39,7 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
 
 BOOL = np.dtype(np.bool_)
+SEQUENCES = (list, tuple, np.ndarray)
 
 
 class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
@@ -78,8 +79,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     Notes
     -----
-    ``reset(options=...)`` takes ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,) and
-    ``"reset_mask"``, a boolean array (num_envs,) of the environments to reset.
+    ``reset(options=...)`` takes ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), or
+    (num_envs, n_targets) if there are several, and ``"reset_mask"``, a boolean array (num_envs,) of the
+    environments to reset.
 
     Examples
     --------
@@ -193,7 +195,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             None keeps the present one.
         options : dict, optional
             ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool.
-            Rows not selected by the mask are ignored.
+            Several targets are (num_envs, n_targets), or a mapping of their names to one number for all or
+            to (num_envs,). Rows not selected by the mask are ignored.
 
         Returns
         -------
@@ -216,6 +219,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             state = np.array([for_environment(i, self.tasks[i].start_state, state[i]) for i in lanes])
         if target is not None:
             many = self.task.formulas.targets
+            if many and isinstance(target, Mapping):
+                target = self._targets_by_name(target)
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
             target = np.array(
                 [np.atleast_1d(for_environment(i, self.tasks[i].check_target, target[i])) for i in lanes]
@@ -612,6 +617,15 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             )
         return array
 
+    def _targets_by_name(self, given: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Return targets given by name, each one number for all or one for each environment, as rows."""
+        names = [t.name for t in self.task.formulas.target_boxes]
+        if set(given) != set(names):
+            raise ValueError(f"target must give {', '.join(names)}, got {shown(given)}")
+        columns = (v if isinstance(v, SEQUENCES) else [v] * self.num_envs for v in map(given.get, names))
+        rows = np.stack([self._check_rows("target", c, (self.num_envs,)) for c in columns], axis=-1)
+        return rows[:, 0] if len(names) == 1 else rows
+
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions, pictures, and the helpers' data."""
         without = ("_program", "_viewers", "_viewed", "_row", "_step_all", "_kind", "_loop", "_calls")
@@ -665,6 +679,12 @@ def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
     )
 
 
+def _is_one_target(kind: type[Task], values: Any) -> bool:
+    """Return whether a sequence has a number for each of several targets: the same for all environments."""
+    several = isinstance(kind.target, Mapping) and len(kind.target) > 1
+    return several and not any(isinstance(v, (Mapping, *SEQUENCES)) for v in values)
+
+
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     """Return one task per environment, all the same object if no option varies."""
     many = {
@@ -672,6 +692,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
         for name, values in options.items()
         if (isinstance(values, list | tuple) or (isinstance(values, np.ndarray) and values.ndim > 0))
         and name not in KEYWORDS
+        and not (name == "target" and _is_one_target(kind, values))
     }
     for name, values in many.items():
         if is_masked(values):

@@ -220,7 +220,8 @@ class Expr:
         return result
 
     def __rpow__(self, base: Any) -> NoReturn:
-        raise FormulaError(f"{base!r} is raised to a recorded power; write xp.exp(x * {base!r}'s logarithm)")
+        log = f"xp.log({float(base) if isinstance(base, numbers.Real) else base!r})"
+        raise FormulaError(f"{base!r} is raised to a recorded power x; write xp.exp(x * {log})")
 
     def _kept(self, exponent: int) -> Expr | None:
         """Return a power of this that is kept as it is, or None if the power is expanded.

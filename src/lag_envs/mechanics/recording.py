@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
+from lag_envs.errors import hint
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, substitute
 from lag_envs.mechanics.equations import Energies, place, velocity
 from lag_envs.mechanics.layout import SceneLayout
@@ -79,7 +81,7 @@ class Values:
             return values[index]
         except IndexError:
             raise FormulaError(
-                f"there is no {self._what} number {index}, only {len(values)} of them"
+                f"there is no {self._what} number {index}, only {len(values)} of them, counted from 0"
             ) from None
 
     def __iter__(self) -> Iterator[Any]:
@@ -173,9 +175,21 @@ def formula(scene: Any, name: str) -> Iterator[None]:
         raise FormulaError(f"{where} assigns to self: {error}; use a local name") from error
     except Exception as error:
         raise FormulaError(
-            f"{where} fails on recorded numbers with {type(error).__name__}: {error}; "
-            "use + - * /, whole powers and functions of xp"
+            f"{where} fails on recorded numbers with {type(error).__name__}: {error}; {_remedy(scene, error)}"
         ) from error
+
+
+def _remedy(of: Any, error: Exception) -> str:
+    """Return what to do about an error in a formula of a scene or task."""
+    if of_numpy := re.search(r"no callable (\w+) method", str(error)):  # np.exp of a recorded number
+        return f"write xp.{of_numpy[1]}, and functions of xp only"
+    owner = getattr(error, "obj", None)
+    ours = owner is not None and type(owner) in (type(of), type(getattr(of, "scene", None)))
+    if not isinstance(error, AttributeError) or not ours:
+        return "use + - * /, whole powers and functions of xp"
+    fields = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
+    otherwise = f"it has {', '.join(fields)}" if fields else "define it in the class"
+    return hint(str(error.name), [name for name in dir(owner) if not name.startswith("_")], otherwise)
 
 
 def check_signature(scene: Any, name: str) -> None:

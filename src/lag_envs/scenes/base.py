@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform, 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.errors import hint
 from lag_envs.mechanics import motion, recording
 from lag_envs.mechanics.algebra import Atom, FormulaError
 from lag_envs.mechanics.equations import place, velocity
@@ -53,7 +54,14 @@ class SceneType(ABCMeta):
         """Return a scene with checked parameters and formulas."""
         complete(cls)
         check_class(cls, Scene)
-        scene = super().__call__(*args, **keywords)
+        try:
+            scene = super().__call__(*args, **keywords)
+        except TypeError as error:
+            fields = [field.name for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
+            unknown = [name for name in keywords if name not in fields]
+            if not unknown:
+                raise
+            raise TypeError(f"{error}; {hint(unknown[0], fields)}") from None
         admit(scene, Scene)
         return scene
 

@@ -128,6 +128,14 @@ def check_controls(scene: Any, control: ArrayLike, ndim: int) -> Array:
     return array
 
 
+def check_control(scene: Any, control: ArrayLike) -> Array:
+    """Return one set of controls as a float64 array of shape (n_controls,), or raise a ValueError."""
+    array = check_controls(scene, control, 1)
+    if array.ndim != 1:
+        raise ValueError(f"the control must be one set of controls, got shape {array.shape}")
+    return array
+
+
 def check_both(scene: Any, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
     """Return states and controls with their last axes, and their common shape without these."""
     states = check_states(scene, state)

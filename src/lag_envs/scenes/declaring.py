@@ -90,6 +90,9 @@ def declare_scene(cls: Any, meta: type[type]) -> None:
         else:
             faults.append(f"{name} has an annotation; write {name} = ... without one")
         del annotations[name]
+    for name in [n for n, v in own.items() if isinstance(v, dataclasses.Field) and n not in annotations]:
+        faults.append(f"{name} has no annotation; write {name}: float = parameter(...)")
+        delattr(cls, name)
     if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
         annotations["control"] = "str"
         if "control" not in own:

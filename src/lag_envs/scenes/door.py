@@ -10,6 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics import recording
@@ -171,6 +172,11 @@ def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> 
                 continue
             if not np.isfinite(matrix).all():
                 continue
-            size = np.sqrt(np.abs(np.diag(matrix)))
-            seen.append(float(np.linalg.eigvalsh(matrix / np.outer(size, size))[0]) if size.all() else 0.0)
+            seen.append(smallest_eigenvalue(matrix))
     return max(seen, default=math.inf)
+
+
+def smallest_eigenvalue(mass: NDArray[np.float64]) -> float:
+    """Return the smallest eigenvalue of a mass matrix, its diagonal scaled to 1."""
+    size = np.sqrt(np.abs(np.diag(mass)))
+    return float(np.linalg.eigvalsh(mass / np.outer(size, size))[0]) if size.all() else 0.0

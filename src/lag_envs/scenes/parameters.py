@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -44,6 +45,13 @@ def parameter(
     """
     if not isinstance(unit, str):
         raise FormulaError(f"the unit of a parameter must be text, got {unit!r:.60}")
+    lows, highs = {"above": above, "at least": least}, {"below": below, "at most": most}
+    for (low, bottom), (high, top) in itertools.product(lows.items(), highs.items()):
+        strict = low == "above" or high == "below"
+        if bottom is not None and top is not None and (bottom > top or (strict and bottom == top)):
+            raise FormulaError(f"no parameter is {low} {bottom:g} and {high} {top:g}")
+    if usable[0] > usable[1]:
+        raise FormulaError(f"usable must be (lowest, highest), in this order, got {usable!r}")
     made = callable(default)
     return dataclasses.field(
         default=None if made else default,

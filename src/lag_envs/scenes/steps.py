@@ -15,7 +15,7 @@ from lag_envs.scenes.checks import (
     StepRefused,
     check_applied,
     check_both,
-    check_controls,
+    check_control,
     check_count,
     check_lags,
     check_parameters,
@@ -34,6 +34,7 @@ from lag_envs.scenes.derivation import (
     series_order_of,
     step_argument_of,
 )
+from lag_envs.scenes.door import SINGULAR, smallest_eigenvalue
 from lag_envs.stepping.elementary import LARGEST_ANGLE
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -107,7 +108,7 @@ def step_bound(
     from lag_envs.stepping.general import StepBound
 
     start, dt = check_state(scene, state), check_step(dt)
-    held = check_controls(scene, control, 1).reshape(-1)
+    held = check_control(scene, control)
     decays, reached = _lagging(scene, lag, applied, dt)
     lagged = decays is not None
     if not lagged and (form := form_of(scene)):
@@ -265,9 +266,7 @@ def energy_balance(
 ) -> dict[str, float]:
     """See `Scene.energy_balance`."""
     dt = check_step(dt)
-    controls = check_controls(scene, control, 1)
-    if controls.ndim != 1:
-        raise ValueError(f"the control must be one set of controls, got shape {controls.shape}")
+    controls = check_control(scene, control)
     points, weights = np.polynomial.legendre.leggauss(check_count("nodes", nodes))
     times = 0.5 * dt * (points + 1.0)
     held: Any = controls[None] if scene.control_names else 1
@@ -295,20 +294,33 @@ def refusal(
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
     values = np.atleast_1d(np.asarray(control, dtype=np.float64))
     held = zip(scene.control_names, values, strict=True)
-    why = "it could not be certified within the largest number of substeps"
-    remedy = "take a smaller dt or milder parameters"
-    if form_of(scene) is not None and not lagged:
-        why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
+    why = "it could not be certified within the largest number of substeps, or has no finite result"
+    remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
+    if not np.isfinite(state).all():
+        why, remedy = "the state is not finite", "reset the episode; if the task has a kick, look there"
+    elif form_of(scene) is not None and not lagged:
+        why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
+        remedy = "take a smaller dt or milder parameters"
     elif far := _far_angles(scene, state, values):
         why = f"it needs sine and cosine of {far}, which are not computed beyond {LARGEST_ANGLE:g} rad"
         remedy = f"subtract whole turns from {far}"
+    elif singular := _singular(scene, state, values):
+        why, remedy = singular, "choose other coordinates, or end or reset the episode before"
     error = StepRefused(
         f"{where} was refused: from ({start}) with "
-        f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}, or has no "
-        f"finite result; {remedy}"
+        f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}; {remedy}"
     )
     error.trajectory = None if trajectory is None else trajectory.copy()
     return error
+
+
+def _singular(scene: Scene, state: Array, control: Array) -> str:
+    """Return why there is no motion from a state, or nothing."""
+    mass = scene.mass_matrix(state, control)
+    if np.isfinite(mass).all() and smallest_eigenvalue(mass) < SINGULAR:
+        return f"the mass matrix of {', '.join(layout_of(scene).free)} is not positive definite there"
+    finite = np.isfinite(mass).all() and np.isfinite([*scene.acceleration(state, control).values()]).all()
+    return "" if finite else "the acceleration there is not finite"
 
 
 def _far_angles(scene: Scene, state: Array, control: Array) -> str:

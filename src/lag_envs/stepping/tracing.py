@@ -186,6 +186,11 @@ class TracedNumber:
     def __invert__(self) -> Any:
         return self.trace.record("~", self)
 
+    def __float__(self) -> float:
+        raise TypeError(
+            "a function of math, or float(), is applied to a recorded number: write xp.exp for math.exp"
+        )
+
     def __bool__(self) -> bool:
         raise TypeError(
             "a formula that is compiled cannot branch on its numbers with if, and, or, min or max; "

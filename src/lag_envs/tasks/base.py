@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import math
@@ -32,6 +33,8 @@ FASTEST_START = 100.0
 #: Largest angle [rad] turned at the speed `Task.fastest` in a step. A step then needs far fewer substeps than
 #: are allowed, even after many steps have added to the speed.
 LONGEST_TURN = 5000.0
+#: Keywords that environments take besides those of their task.
+OF_ENVIRONMENTS = ("render_mode", "diagnostics", "show_arrows", "show_trail", "show_readout")
 
 
 class Task:
@@ -182,17 +185,20 @@ class Task:
                     f"{type(self).__name__}.{mapping}: {kind.__name__} has no parameter {name!r}; "
                     f"{hint(name, known)}"
                 )
+        for name, pair in self.usable.items():
+            if not (isinstance(pair, Sequence) and len(pair) == 2 and pair[0] <= pair[1]):
+                raise FormulaError(
+                    f"{type(self).__name__}.usable[{name!r}] must be (lowest, highest), in this order, "
+                    f"got {pair!r:.60}"
+                )
         for name in sorted(set(parameters) - set(known)):
-            options = [
-                *sorted(known),
-                "dt",
-                "duration",
-                *(["target"] if type(self).target else []),
-                *KEYWORDS,
-            ]
+            target = ["target"] if type(self).target else []
+            options = [*sorted(known), "dt", "duration", *target, *KEYWORDS, *OF_ENVIRONMENTS]
+            meant = "gym.make_vec makes many;" if name == "num_envs" else hint(name, options, " ").strip()
             # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
             raise TypeError(
-                f"got an unexpected keyword argument {name!r}; this environment takes {', '.join(options)}"
+                f"got an unexpected keyword argument {name!r}; {meant}{' ' if meant else ''}this environment "
+                f"takes {', '.join(options)}"
             )
         #: Parameters of the scene that were given, here or by the class.
         self.given = dict(self.defaults) | parameters
@@ -203,14 +209,16 @@ class Task:
         interval = check_number(f"{of}.interval", self.interval, "s")
         self.dt = interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
-            raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
+            name = f"{of}.interval" if dt is None else "dt"
+            raise ValueError(f"{name} must lie between 1e-6 and 1 s, got {self.dt:g} s")
         steps = check_number(f"{of}.steps", self.steps, endless=True)
         if steps != math.inf and steps % 1.0:
             raise ValueError(f"{of}.steps must be a whole number, or infinity for no end, got {steps:g}")
         seconds = interval * steps if duration is None else duration
         self.duration = check_number("duration", seconds, "s", endless=True)
         if not self.duration >= self.dt:
-            raise ValueError(f"duration must be at least dt={self.dt:g} s, got {self.duration:g} s")
+            name = f"duration ({of}.steps * {of}.interval)" if duration is None else "duration"
+            raise ValueError(f"{name} must be at least dt={self.dt:g} s, got {self.duration:g} s")
         self.fixed_target: NDArray[np.float64] | None = None
         self.check()
         self.check_usable()
@@ -261,7 +269,17 @@ class Task:
         """Raise ValueError if the parameters do not fit the task."""
 
     def check_start(self, state: Any) -> None:
-        """Raise ValueError for an impossible start; `state` is accessed by name or by index."""
+        """Raise ValueError for an impossible start: by default, one at which the episode would be over.
+
+        `state` is accessed by name or by index.
+        """
+        numbers, ended = np.array([*state]), False
+        # An ending that depends on the target is left to the first step.
+        with contextlib.suppress(AttributeError, TypeError), np.errstate(all="ignore"):
+            ended = bool(self.terminated(self.formulas.named_state([*numbers]), None, np))
+        if ended:
+            given = ", ".join(f"{n}={x:g}" for n, x in zip(self.scene.state_names, numbers, strict=True))
+            raise ValueError(f"the episode would be over at {given}; give a state where it goes on")
 
     @property
     def fastest(self) -> float:
@@ -432,14 +450,17 @@ class Task:
         if not names:
             raise ValueError(f"this task has no target, got target={target!r}")
         if isinstance(target, Mapping):
-            if sorted(target) != sorted(names):
+            if set(target) != set(names):
                 raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
             target = [target[name] for name in names]
         elif len(names) == 1:
             return check_number("target", target)
         array = np.atleast_1d(real_array("target", target))
         if array.shape != (len(names),):
-            raise ValueError(f"target must be {', '.join(names)}, got {target!r}")
+            raise ValueError(
+                f"target must be {len(names)} numbers ({', '.join(names)}), or a mapping of these names, "
+                f"got {target!r}"
+            )
         for name, value in zip(names, array, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"target {name} must be finite, got {value}")

@@ -50,20 +50,6 @@ class _OnTrack(Task):
         """Return whether the cart has left its track."""
         return xp.abs(after.x) > self.track
 
-    def check_start(self, state: Any) -> None:
-        """Refuse a start from which the episode would be over."""
-        if self.terminated(state, None, _NumberFunctions):
-            raise ValueError(
-                f"the start must lie inside the limits at which an episode ends, got x={state.x:g} m, "
-                f"theta={state.theta:g} rad"
-            )
-
-
-class _NumberFunctions:
-    """What `terminated` needs of a namespace, for numbers."""
-
-    abs = staticmethod(abs)
-
 
 class CartPoleExact(_OnTrack):
     """Balance a pole on a cart with pushes to the left or right: Gymnasium's CartPole-v1, stepped exactly.

@@ -342,7 +342,8 @@ class TaskFormulas:
 
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
         """Return the state after a kick."""
-        added = self._call("kick", k, self.named_state(z), draws, self._known(xp, z))
+        drawn = Values("random draw", {str(i): draw for i, draw in enumerate(draws)})
+        added = self._call("kick", k, self.named_state(z), drawn, self._known(xp, z))
         if not isinstance(added, Mapping):
             self._refuse("kick", added, "changes of the state's entries by name")
         after = dict(zip(self.state, z, strict=False))
@@ -404,7 +405,8 @@ class TaskFormulas:
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
 
     def _refuse(self, name: str, found: Any, wanted: str) -> NoReturn:
-        got = "a number" if isinstance(found, TracedNumber) else f"{found!r:.60}"
+        kinds = {TracedNumber: "a number", np.ndarray: "an array", list: "a list", tuple: "a tuple"}
+        got = kinds.get(type(found)) or f"{found!r:.60}"
         raise FormulaError(f"{type(self._task).__name__}.{name} returns {got}; it must return {wanted}")
 
     def sample_targets(self, draws: Sequence, k: Any) -> list:
@@ -518,8 +520,8 @@ def control_of(acting: Acting, a: Any, xp: Any) -> Any:
 def _numbers_of(where: str, value: Any) -> tuple[float, ...]:
     try:
         return tuple(check_number(where, v) for v in value)
-    except (TypeError, ValueError) as error:
-        raise FormulaError(f"{where}: {error}") from error
+    except ValueError as error:
+        raise FormulaError(str(error)) from error
 
 
 def _mapping(task: Task, name: str) -> dict[str, Any]:
@@ -542,14 +544,11 @@ def _acting(task: Task) -> list[Acting]:
                 raise FormulaError(f"{where} must list at least two values, got {given!r}")
             found.append(Acting(name, min(values), max(values), values))
             continue
-        low, high = (
-            _numbers_of(where, given if isinstance(given, tuple) else (given,))
-            if isinstance(given, tuple)
-            else (-check_number(where, given), check_number(where, given))
-        )
-        if not low < high:
+        pair = _numbers_of(where, given if isinstance(given, tuple) else (given,))
+        pair = pair if isinstance(given, tuple) else (-pair[0], pair[0])
+        if len(pair) != 2 or not pair[0] < pair[1]:
             raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
-        found.append(Acting(name, low, high))
+        found.append(Acting(name, *pair))
     if known and not found:
         raise FormulaError(f"{of}.action must give limits of controls, as in {{{known[0]!r}: 1.0}}")
     return found

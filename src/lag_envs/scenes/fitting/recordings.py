@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +55,8 @@ def recordings_of(scene: Scene, given: Any) -> list[Recording]:
         raise ValueError(
             f"recordings must be a list of (states, controls, dt), at least one, got {shown(given)}"
         )
+    if isinstance(given[-1], numbers.Real):
+        raise ValueError("recordings must be a list of (states, controls, dt), got one; put it into a list")
     found = []
     for i, one in enumerate(given):
         if not isinstance(one, tuple | list) or len(one) != 3:
