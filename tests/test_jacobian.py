@@ -186,9 +186,7 @@ def test_step_that_is_refused():
     bar = scenes.PivotedBar(damping=0.0)
     with pytest.raises(StepRefused, match=r"the step of row 1.* more than 1,000,000 substeps"):
         bar.jacobian([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1e12]])
-    with pytest.raises(
-        StepRefused, match=r"cosine of theta, .* beyond 2.6e\+07 rad; subtract whole turns"
-    ):
+    with pytest.raises(StepRefused, match=r"cosine of theta, .* beyond 2.6e\+07 rad; subtract whole turns"):
         RotaryPendulum().jacobian([0.2, 1.0, 3e7, 0.0], 0.1, dt=0.02)
     with pytest.raises(StepRefused, match="the step of row 1"):
         Rope().jacobian([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]], dt=0.02)
