@@ -68,6 +68,11 @@ def engine(kind: type[Task]) -> frozenset[str]:
     return frozenset(["imperfect" if kind.imperfections else form.kind.__name__ if form else "series"])
 
 
+def way(kind: type[Task]) -> frozenset[str]:
+    """Return how a step is computed, in the roughest words."""
+    return frozenset(["imperfect" if kind.imperfections else "flow" if form_of(kind().scene) else "series"])
+
+
 @cache
 def size(kind: type[Task]) -> int:
     """Return how many coordinates a task's scene has."""

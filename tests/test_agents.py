@@ -230,6 +230,7 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
 # --- the scale of scores ---
 
 
+@pytest.mark.slow
 def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(scale, "BATCH", 500)
     file = tmp_path / "scale.json"

@@ -257,6 +257,7 @@ def test_mpc_begins_with_the_best_recorded_plan():
         np.testing.assert_allclose(found.gains[i, :, 0], -law.gains)
 
 
+@pytest.mark.slow
 def test_mpc_from_recorded_plans_is_the_same_alone():
     env_id, agents = chain.SwingUp.id, [make_controller(chain.SwingUp.id, "MPC") for _ in range(2)]
     rollouts = [Rollout(env_id, agent, SEEDS[:n]) for agent, n in zip(agents, (3, 1), strict=True)]
@@ -288,6 +289,7 @@ def test_mpc_begins_only_with_plans_of_its_task():
         MPC(unplanned, first=[law])
 
 
+@pytest.mark.slow
 def test_mpc_rescues_what_the_regulator_would_lose():
     task = chain.Balance()
     model, read = Model(without_kicks(task)), ObservationDecoder(task)

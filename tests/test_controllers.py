@@ -156,6 +156,7 @@ def test_one_observation_is_answered_as_a_batch(env_id, name, observations):
         np.testing.assert_allclose(agent.predict(one)[0], action, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_plans_are_kept_outside(observations):
     task = make_task(SHELL, duration=1.0)
     agent = ILQR(task, [TiltLQR(task)], iterations=3, steps=12)

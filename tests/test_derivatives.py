@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import own_tasks
 import pytest
-from covering import covering, engine, slow
+from covering import covering, engine, slow, way
 from test_jacobian import exact_step
 
 from lag_envs.envs.model import Model
@@ -49,7 +49,7 @@ def check_directions(scene, state, control, dt, directions):
             assert (np.abs(found @ direction - expected) <= 1e-10 * size).all(), direction
 
 
-@pytest.mark.parametrize("env_id", covering(of=engine))
+@pytest.mark.parametrize("env_id", covering(of=way))
 def test_jacobian_by_all_parameters(env_id):
     """Along a random direction, so that two exact steps are enough; over the task's own control interval."""
     task, rng = TASKS[env_id](), seeded(env_id)
@@ -196,12 +196,6 @@ def starts(task, rng, n):
             states[i] = after[0]
     # A guard leads exactly to the edge where it begins to act: there, two derivatives meet.
     return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
-
-
-def way(kind):
-    """Return how a task's step is differentiated."""
-    found = "imperfect" if kind.imperfections else "closed form" if form_of(kind().scene) else "series"
-    return frozenset([found])
 
 
 @pytest.mark.parametrize("env_id", covering(SMOOTH, of=way))

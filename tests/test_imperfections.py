@@ -89,7 +89,7 @@ WHOLE = ALL | {"observation_delay": 0.04, "action_delay": 0.06}
 
 @pytest.mark.parametrize(
     ("mode", "lag"),
-    [("NextStep", 0.01), slow("SameStep", 0.01), slow("NextStep", None), slow("SameStep", None)],
+    [slow("NextStep", 0.01), slow("SameStep", 0.01), slow("NextStep", None), slow("SameStep", None)],
 )
 def test_what_divides_no_step_single_and_vector(mode, lag):
     _, envs = played(ID, 3, 70, mode, duration=0.5, **WHOLE | {"lag": lag})

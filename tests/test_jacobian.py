@@ -126,7 +126,10 @@ HEAVY = {
 
 
 #: Those that take seconds to compile or in exact arithmetic.
-LONG = ("shell turns", "support driven", "shell turns without gravity", "the control is the drag")
+LONG = (
+    "support at rest", "support driven", "shell turns", "shell turns without gravity",
+    "the control is the drag",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

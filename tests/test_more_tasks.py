@@ -117,10 +117,10 @@ def test_spinning_does_not_pay(env_id, state, share):
 @pytest.mark.parametrize(
     ("env_id", "state"),
     [
-        (Reach.id, [-0.5 * math.pi, 0.0, 0.0, 0.0]),
-        (Reach.id, [0.3, 0.0, math.pi, 0.0]),
+        slow(Reach.id, [-0.5 * math.pi, 0.0, 0.0, 0.0]),
+        slow(Reach.id, [0.3, 0.0, math.pi, 0.0]),
         (AcrobotReal.id, [math.pi, 0.0, 0.0, 0.0]),
-        (AcrobotReal.id, [0.0, 0.0, math.pi, 0.0]),
+        slow(AcrobotReal.id, [0.0, 0.0, math.pi, 0.0]),
         (RotarySwingUp.id, [0.0, 0.0, 0.0, 0.0]),
         (SwingUp.id, [0.0, 0.0, 0.0, 0.0, math.pi, 0.0]),
     ],

@@ -298,6 +298,7 @@ def test_one_who_plans_among_listed_actions_is_the_same_again(tmp_path, env):
     assert returns[0] == returns[1] > played_alone(env, Choice(TASKS[env]()), 40)
 
 
+@pytest.mark.slow
 def test_one_who_plans_ahead_for_two_controls(tmp_path):
     env = Reach.id
     policy = AHEAD | {"horizon": 40, "every": 5, "iterations": 2, "budget": 20_000}

@@ -41,6 +41,7 @@ def test_rows_in_the_order_of_the_jobs(tmp_path):
     assert all(r.problem is None for r in results)
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_costs_its_own_rows_only(tmp_path):
     told = []
     jobs = [

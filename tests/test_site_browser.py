@@ -449,6 +449,7 @@ def test_agents_page(open_page):
     assert page.evaluate("document.querySelectorAll('#curves path').length") >= 3
 
 
+@pytest.mark.slow
 def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     moved = """new Promise(done => { const c = document.querySelector('.hero canvas');
         const before = c.toDataURL(); setTimeout(() => done(c.toDataURL() !== before), 400); })"""

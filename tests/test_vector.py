@@ -10,7 +10,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering, engine, features, quick, slow
+from covering import covering, engine, features, quick, slow, way
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -149,7 +149,7 @@ def test_same_bits_for_long(env_id, mode, n, steps):
     assert assert_alike(native, sync, steps, seed=2) >= n
 
 
-@in_every_mode(of=engine)
+@in_every_mode(of=way)
 def test_same_bits_where_parameters_differ(env_id, mode):
     native, sync = mixed_pair(env_id, mode, **lasting(env_id, 250))
     assert_same(native.reset(seed=5), sync.reset(seed=5))
@@ -164,7 +164,7 @@ def test_same_bits_where_parameters_differ(env_id, mode):
         ).all()
 
 
-@each_id
+@each_engine
 def test_same_bits_with_a_coarse_step(env_id):
     dt = min(10.0 * TASKS[env_id].interval, 0.2)  # more than one substep here and there
     native, sync = pair(env_id, 7, dt=dt, **lasting(env_id, 200))
