@@ -162,6 +162,7 @@ def test_acrobot_is_much_faster_than_any_learner():
     assert returns.mean() > -61.0 and returns.min() > -70.0
 
 
+@pytest.mark.slow
 def test_a_narrow_search_is_faster_than_any_learner_too():
     agent = beam(acrobot.AcrobotExact(), energy=1.0, width=300)
     assert play(ACROBOT, agent, range(1)).min() > -75.0

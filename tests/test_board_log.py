@@ -218,7 +218,7 @@ def test_a_log_that_is_replaced_while_one_waits(board):
         slow(("every_step",)),
         ("random_moments", "6"),
         slow(("random_moments", "200")),
-        ("at_once", "3", "5"),
+        slow(("at_once", "3", "5")),
         slow(("at_once", "8", "40")),
         ("finished_at_once", "3", "4"),
     ],

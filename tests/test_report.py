@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from covering import slow
 from matplotlib.figure import Figure
 
 from lag_envs.cli import main
@@ -92,7 +93,7 @@ def test_timings_run_alone(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
-@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+@pytest.mark.parametrize("name", ["SIGINT", slow("SIGKILL")])
 def test_interrupt_keeps_what_is_finished(tmp_path, name):
     code = (
         "from tests.dummy_section import job\n"

@@ -251,6 +251,7 @@ def test_a_folder_with_other_files_is_refused(data, tmp_path):
     assert (tmp_path.parent / "precious.html").exists()
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
     small = board_pages.data(("PivotedBar-v0", incline.Brake.id), board_pages.AGENTS[:1])
     other = board_pages.data((incline.Brake.id, cylinder_in_cylinder.Tilt.id), board_pages.AGENTS[1:2])
