@@ -296,6 +296,7 @@ def test_observations_are_read_back(env_id):
     read = ObservationDecoder(TASKS[env_id]())
     env = gym.make(env_id)
     env.reset(seed=3)
+    env.action_space.seed(3)  # by chance, PendulumExact becomes faster than its observation tells
     for _ in range(50):
         observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
         off = read.difference(read(observation)[0], env.unwrapped.state)
