@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
-#: A part of a step may leave out this many tolerances of what its own terms sum up to. Where terms of the
-#: whole step are many orders larger, as in stiff linear motion, one tolerance of their sum allows anything.
-OWN = 30.0
+#: A part of a step may leave out this many tolerances of what its own terms sum up to. In stiff linear motion
+#: the terms of the whole step are many orders larger, and one tolerance of their sum allows anything.
+PART_TOLERANCES = 30.0
 
 
 class Certificate:
@@ -106,7 +106,8 @@ class Certificate:
         for bound, rest in zip(self._bounds, self._rest, strict=True):
             passed = t.both(passed, t.less(bound, rest))
         if part is not None:
-            own = t.mul(t.mul(t.number(OWN), self._tolerance), self._largest_of(self._sums(part)))
+            allowed = t.mul(t.number(PART_TOLERANCES), self._tolerance)
+            own = t.mul(allowed, self._largest_of(self._sums(part)))
             for bound, per in zip(self._bounds, self._per_root, strict=True):
                 passed = t.both(passed, t.less(bound, t.mul(own, per)))
         return passed, self._bounds

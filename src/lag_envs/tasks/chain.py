@@ -326,8 +326,7 @@ When the board opened, one recorded plan with time-varying feedback was best; it
 chain. One of PPO's seeds has learnt a better swing since. Plans that are improved before the start use the
 control at its limits, where feedback has no authority, and lose the chain on the way. MPC begins with the
 recorded plan or its mirror image, improves it a little every other step, and follows it by the same kind of
-feedback. It is better than the recorded plan, and never lost the chain in trials, but that seed's
-swing is better still.
+feedback. It is better than the recorded plan, but that seed's swing is better still.
 """
 
 
