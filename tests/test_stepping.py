@@ -81,7 +81,7 @@ def advance_of(scene, dt):
 def test_every_task_is_one_certified_step():
     """At the corners of TASKS' ranges of state and control one step is enough, to 1e-12 in theta'.
 
-    A long control step may take two.
+    With a long control step, or a strong brake, it may take two.
     """
     pendulums = set()
     for name, kind in TASKS.items():
@@ -90,7 +90,7 @@ def test_every_task_is_one_certified_step():
             bound = task.scene.step_bound(*case, task.dt)
             if bound.order:
                 pendulums.add(name)
-                assert bound.substeps <= (1 if task.dt <= 0.03 else 2), (name, case)
+                assert bound.substeps <= (1 if bound.order == 14 else 2), (name, case)
                 assert 0.0 < bound.bounds["theta"] < bound.bounds["theta_dot"] <= 1e-12, (name, case)
     assert len(pendulums) == 9
 

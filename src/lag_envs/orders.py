@@ -32,7 +32,7 @@ def measure_orders(
     Parameters
     ----------
     task : type
-        A task whose scene has no closed form.
+        A task whose scene has no flow of its own.
     num_envs : int
         Size of the batch.
     rounds, steps : int
@@ -43,8 +43,8 @@ def measure_orders(
     envs = LagrangianVectorEnv(task, num_envs)
     if envs.order is None:
         raise UserError(
-            f"{task.__name__} is stepped in closed form, as {type(envs.scene).__name__} moves like a "
-            "pendulum or on a slope: there is no order to choose"
+            f"{task.__name__} has a flow of its own, as {type(envs.scene).__name__} moves like a pendulum or on "
+            "a slope: only orders of the general series are measured"
         )
     envs.reset(seed=0)
     envs.action_space.seed(0)

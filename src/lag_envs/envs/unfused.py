@@ -47,13 +47,12 @@ from lag_envs.envs.program import DRAWS
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values
 from lag_envs.scenes import picture
-from lag_envs.scenes.base import ORDER
-from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
+from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, series_order_of
 from lag_envs.scenes.shapes import Frame
 from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split_lengths
-from lag_envs.stepping.general import stepper_of, usual_order
+from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, run_python, script_motion
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.stepping.tracing import TracedNumber
@@ -151,7 +150,7 @@ class UnfusedProgram:
         #: Constants for formulas; zeros leave no code.
         self._k = {name: 0.0 if numbers[name] == 0.0 else place for name, place in self._place.items()}
         self._record = self._stepper.record(gone, fused=False)
-        order = vars(scene).get(ORDER) or usual_order(task.dt)
+        order = series_order_of(scene, task.dt)
         self._order, self._tolerance = (order // 2, SINGLE_TOLERANCE) if single else (order, TOLERANCE)
         self.states = len(formulas.state)
         self._width = self._form.width if self._form else self.states

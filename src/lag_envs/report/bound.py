@@ -132,7 +132,7 @@ def step_at(omega: float, drive: Coefficients, x: float) -> float:
 
 def majorant(x: float, h: float, order: int) -> tuple[float, float]:
     """Return the bounds on one step's truncation errors in θ and θ'."""
-    tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0)
+    tail = pendulum.tail(x, order)
     return tail / (order + 2), tail / h
 
 

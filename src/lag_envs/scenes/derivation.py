@@ -64,7 +64,12 @@ def form_of(scene: Scene) -> NormalForm | None:
     """Return the equation of motion's normal form if it has an exact flow of its own, else None."""
     from lag_envs.stepping.normal_forms import normal_form
 
-    return normal_form(scene.mechanics)
+    return normal_form(scene.mechanics, chosen_order_of(scene))
+
+
+def chosen_order_of(scene: Scene) -> int:
+    """Return the order of the series that the scene's task chose, or 0."""
+    return int(vars(scene).get(ORDER, 0))
 
 
 def motion_constants_of(scene: Scene, lagged: bool = False) -> dict[str, float]:
@@ -105,7 +110,7 @@ def series_order_of(scene: Scene, dt: float) -> int:
     """Return the order of the general series for a control step."""
     from lag_envs.stepping.general import usual_order
 
-    return vars(scene).get(ORDER) or usual_order(dt)
+    return chosen_order_of(scene) or usual_order(dt)
 
 
 def step_argument_of(scene: Scene, dt: float, lagged: bool = False) -> float:

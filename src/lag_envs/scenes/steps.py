@@ -25,6 +25,7 @@ from lag_envs.scenes.checks import (
     real_array,
 )
 from lag_envs.scenes.derivation import (
+    chosen_order_of,
     code_of,
     form_of,
     layout_of,
@@ -238,7 +239,7 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     from lag_envs.stepping.normal_forms import normal_form
 
     mechanics = mechanics_with(scene, by)
-    form, numbers = normal_form(mechanics), parameter_values(scene)
+    form, numbers = normal_form(mechanics, chosen_order_of(scene)), parameter_values(scene)
     try:
         if form:
             constants, rates = form.constants(numbers), form.rates(numbers, by)

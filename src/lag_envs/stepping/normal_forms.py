@@ -61,6 +61,8 @@ class NormalForm:
         Each constant as an expression, times the inertia.
     inertia : Expr
         The free coordinate's entry of the mass matrix.
+    chosen : int
+        Order of the flow's series, if it has one; 0 to choose it by the control step.
     """
 
     kind: ClassVar[type[Any]]
@@ -68,6 +70,7 @@ class NormalForm:
     terms: Mapping[str, tuple[CoefficientTerm, ...]]
     expressions: Mapping[str, Expr]
     inertia: Expr
+    chosen: int = 0
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -286,11 +289,11 @@ class DrivenPendulum(NormalForm):
     def order(self, dt: float) -> int:
         """Return the order of the series for a control step.
 
-        With order 14, one series of 0.02 s is certified up to 13 rad/s. Longer steps, and a brake that may be
-        strong, need order 20: one series of 0.05 s is then certified up to 9.5 rad/s; order 16 takes two.
+        Order 14 is enough for most steps up to 0.03 s, order 16 for those up to 0.05 s and for brakes, which
+        may be strong.
         """
         brakes = any(term.held.number is None for term in self.terms["gamma"])
-        return 20 if brakes or dt > 0.03 else 14
+        return self.chosen or (20 if dt > 0.05 else 16 if brakes or dt > 0.03 else 14)
 
     def flow(self, dt: float) -> Flow:
         """Return the exact flow for control steps of this length."""
@@ -358,14 +361,23 @@ def _float(x: Any, divisor: Any) -> float:
 # --- recognition --------------------------------------------------------------------------------------------
 
 
-def normal_form(m: Mechanics) -> NormalForm | None:
-    """Return the normal form of these equations of motion, or None if they have none."""
-    if m.key not in _known:
-        _known[m.key] = _recognised(m)
-    return _known[m.key]
+def normal_form(m: Mechanics, order: int = 0) -> NormalForm | None:
+    """Return the normal form of these equations of motion, or None if they have none.
+
+    Parameters
+    ----------
+    m : Mechanics
+        The equations of motion.
+    order : int
+        Order of the flow's series, if it has one; by default it is chosen by the control step.
+    """
+    if (m.key, order) not in _known:
+        form = normal_form(m) if order else _recognised(m)
+        _known[m.key, order] = form and dataclasses.replace(form, chosen=order)
+    return _known[m.key, order]
 
 
-_known: dict[str, NormalForm | None] = {}
+_known: dict[tuple[str, int], NormalForm | None] = {}
 
 
 def _recognised(m: Mechanics) -> NormalForm | None:

@@ -10,13 +10,18 @@ W' = -P - ΓW + D + R tau, P' = QW, and from the energy identity Q' = WW' + ΓW�
 second convolution: with H = W²/2 it reads Q' = H' + 2ΓH - (D + R tau) W. No sine or cosine is called; the
 pair (cos, sin) is rotated by the step's angle with two short polynomials.
 
-**Bound** (method of majorants). E = Q + iP obeys E' = iWE, so |E_0| = G = √(A² + B²). Suppose that for some x
+**Bound of one series** (method of majorants). E = Q + iP obeys E' = iWE, so |E_0| = G = √(A² + B²). With
+a = |W_0| + |Γ| and b = G + |D| + |Γ W_0|, suppose that some x and y, x/5 <= y <= x, fulfil
 
-    |W_0| <= x,   x²/2 >= |Γ|x + G + |D|,   x (x²/2 - |Γ|x/2 - G) >= |R|.
+    a <= y,   b <= z = x (x - y/2),   a b + |R| <= y z.
 
-With κ = x/2 the series x/(1-κτ) and G/(1-κτ)² then satisfy the same recurrences with >= in place of =, so
-|W_k| <= xκ^k for every k. For a series cut off after W_N, the truncation error is at most xκ^(N+1)/(1-κ) in
-hθ', and at most xκ^(N+1)/((1-κ)(N+2)) in θ.
+Then the solution of V'' = V V' with V(0) = y, V'(0) = z has coefficients V_k >= |W_k| for k >= 1. It is a
+tangent, and its pole nearest to 0 is at least 2/x away. With κ = x/2, its expansion in poles gives |W_k| <=
+(5/4) xκ^k for k >= 7. For a series cut off after W_N, the truncation error is at most (5/4) xκ^(N+1)/(1-κ) in
+hθ', and that divided by N + 2 in θ.
+
+**Bound of substeps.** If x²/2 >= |Γ|x + G + |D| and x (x²/2 - |Γ|x/2 - G) >= |R| too, for an x >= |W|, then
+xκ^k >= |W_k| by induction, without the factor 5/4. docs/numerics.md has the proofs.
 
 If one series is not enough, the step is divided. Sums over many substeps are computed with twice the digits
 (`substep`); under heavy damping most substeps are saved by following the slow manifold.
@@ -38,6 +43,8 @@ from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
 ORDER = 16
 TOLERANCE = 1e-12
+#: Factor of the bound of one series of order 6 or more, for all other poles of the tangent: 1.2426, rounded up.
+LOSS = 1.25
 MAX_SUBSTEPS = 1_000_000
 #: Substeps compute the coefficients up to this one with twice the digits. Rounding errors of later ones are
 #: below 1e-20, for the coefficients shrink at least fivefold from one to the next.
@@ -94,10 +101,8 @@ def taylor_coefficients(w: Any, c: Any, s: Any, coeffs: Coefficients, order: int
         # The convolution of W with itself is symmetric, so half of its products are enough.
         pairs = [(W[j], W[k - j]) for j in reversed(range((k + 1) // 2))]
         H.append(sum_of_products(pairs if k % 2 else [(0.5 * W[k // 2], W[k // 2]), *pairs]))
-        work = H[k - 1] * (gamma * (2.0 / k)) - d * W[k - 1] * (1.0 / k)
-        if k > 1:
-            work = work - r * W[k - 2] * (1.0 / k)
-        Q.append(H[k] + work)
+        work = (2.0 * gamma) * H[k - 1] - d * W[k - 1] - (r * W[k - 2] if k > 1 else 0.0)
+        Q.append(H[k] + work * (1.0 / k))
         # P_k itself is not needed: it goes straight into W. The terms known last are added last.
         early = sorted(range(k), key=lambda j: (max(j, k - 1 - j), j))
         torque = sum_of_products((Q[j], W[k - 1 - j]) for j in early)
@@ -247,31 +252,52 @@ def step_slopes(
     return [*angle, *(pairwise_sum(turned[1:]) * (1.0 / h))]
 
 
+def _absent(coefficient: Any) -> bool:
+    return isinstance(coefficient, float) and coefficient == 0.0
+
+
 def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
-    """Return whether the three conditions of the bound hold for this x; written without a root."""
+    """Return whether the conditions of the bound of one series hold for this x."""
     a, b, gamma, d, r = scaled(coeffs, h)
-    half, loss = 0.5 * (x * x), xp.abs(gamma) * x
-    room = half - loss - xp.abs(d)
-    if not (isinstance(r, float) and r == 0.0):
-        room = xp.minimum(room, half - 0.5 * loss - xp.abs(r) * (1.0 / x))
-    return (xp.abs(omega * h) <= x) & (room >= 0.0) & (a * a + b * b <= room * room)
+    speed, drag = xp.abs(omega * h), xp.abs(gamma)
+    first, push = speed + drag, xp.abs(d) + drag * speed
+    # Without a ramp the smallest y is best, and no root is needed.
+    room = x * (x - 0.5 * xp.maximum(first, 0.2 * x)) - push
+    field = a * a + b * b
+    fits = (first <= x) & (room >= 0.0) & (field <= room * room)
+    if _absent(r):
+        return fits
+    second, most = (xp.abs(a) if _absent(b) else xp.sqrt(field)) + push, x * x
+    # With one, the largest y is: the smaller of x and 2 (x - b/x).
+    product = xp.minimum(most, 2.0 * (most - second)) * xp.maximum(0.5 * most, second)  # x y z
+    return fits & ((first * second + xp.abs(r)) * x <= product)
 
 
 def largest_majorant(dt: float, order: int = ORDER) -> float:
     """Return the largest x for which one step of length dt is exact to `TOLERANCE` in θ' [rad/s].
 
-    Solves xκ^(N+1)/(1-κ) = `TOLERANCE`·dt with κ = x/2, minus a margin larger than rounding.
+    Solves (5/4) xκ^(N+1)/(1-κ) = `TOLERANCE`·dt with κ = x/2, minus a margin larger than rounding.
 
     Examples
     --------
     >>> round(largest_majorant(0.02) / 2, 3)
-    0.165
+    0.162
     """
     x = 0.3
     for _ in range(60):
-        x = 2.0 * (TOLERANCE * dt * (1.0 - x / 2.0) / x) ** (1.0 / (order + 1))
+        x = 2.0 * (TOLERANCE * dt * (1.0 - x / 2.0) / (LOSS * x)) ** (1.0 / (order + 1))
         x = min(x, 0.5)  # the polynomials of `rotate` are exact to 0.6 rad
     return x * (1.0 - 1e-14)
+
+
+def least_majorant(omega: float, coeffs: Coefficients, h: float) -> float:
+    """Return an x, small though not the smallest, for which the conditions of `certified` hold."""
+    a, b, gamma, d, r = scaled(coeffs, h)
+    speed, more = abs(omega * h), abs(r) ** (1.0 / 3.0)
+    # With `more` added to one and its square to the other, their product grows by |R| at least.
+    first = speed + abs(gamma) + more
+    second = math.hypot(a, b) + abs(d) + abs(gamma) * speed + more * more
+    return max(first, 0.25 * (first + math.sqrt(first * first + 16.0 * second)), math.sqrt(second / 0.9))
 
 
 def certified_speed(coeffs: Coefficients, dt: float, order: int = ORDER) -> float:
@@ -279,8 +305,10 @@ def certified_speed(coeffs: Coefficients, dt: float, order: int = ORDER) -> floa
     x = largest_majorant(dt, order)
     if not certified(0.0, coeffs, dt, x, np):
         return -1.0
-    speed = x / dt
-    return speed if speed * dt <= x else math.nextafter(speed, 0.0)
+    low, high = 0.0, 2.0 * x / dt
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (middle, high) if certified(middle, coeffs, dt, x, np) else (low, middle)
+    return low
 
 
 class Bound(NamedTuple):
@@ -308,11 +336,14 @@ def truncation_bound(omega: float, coeffs: Coefficients, dt: float, order: int =
     n = 1.0 if one else min(float(_substeps(omega, *coeffs, dt, order)), 1e15)
     h = dt / n
     # One step needs the bound only at its start, several need it throughout.
-    x = _rate(omega, *coeffs, 0.0 if one else dt) * h
-    if one:
-        x = min(x, largest)
-    tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0) if x < 2.0 else math.inf
-    return Bound(int(n), order, n * tail / (order + 2), n * tail / h)
+    x = min(least_majorant(omega, coeffs, dt), largest) if one else _rate(omega, *coeffs, dt) * h
+    left_out = tail(x, order) * (1.0 if one else n / LOSS)
+    return Bound(int(n), order, left_out / (order + 2), left_out / h)
+
+
+def tail(x: float, order: int = ORDER) -> float:
+    """Return the bound on what one series leaves out of hθ'."""
+    return LOSS * x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0) if x < 2.0 else math.inf
 
 
 def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untyped-def]

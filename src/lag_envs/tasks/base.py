@@ -77,7 +77,7 @@ class Task:
     unbounded : float
         Bound in the space for unbounded observations: the largest float32, or infinity.
     order : int, optional
-        Order of the general series, 6 to 24; by default it follows from `dt`. Slow motions are stepped
+        Order of the series, 6 to 24; by default it follows from `dt`. Slow motions are stepped
         faster with a lower order, fast ones with a higher one. Steps are certified with any order.
         ``lag-envs order FILE`` measures the best.
     usable : mapping
