@@ -40,9 +40,9 @@ def test_an_order_out_of_range_changes_nothing(order):
     assert envs.order == CartPoleExact.order
 
 
-def test_closed_forms_have_none():
+def test_flows_have_none():
     assert LagrangianVectorEnv(PENDULUM, 2).order is None
-    with pytest.raises(UserError, match="closed form"):
+    with pytest.raises(UserError, match="a flow of its own"):
         orders.measure_orders(PENDULUM)
 
 
@@ -69,4 +69,4 @@ def test_command(capsys):
 
 def test_command_refuses_what_has_no_series(capsys):
     assert main(["order", "PivotedBar-v0"]) == 2
-    assert "closed form" in capsys.readouterr().err
+    assert "a flow of its own" in capsys.readouterr().err
