@@ -461,7 +461,8 @@ def test_numbers_in_the_prose():
         "docs/numerics.md": [
             f"more than {pendulum.MAX_SUBSTEPS:,} substeps",
             f"blocks of {BLOCK} environments",
-            f"order is {order_of(bar, 0.03)}, and {order_of(bar, 0.031)} for steps above 0.03 s and where",
+            f"order is {order_of(bar, 0.03)} up to 0.03 s, {order_of(bar, 0.05)} up to 0.05 s and where the "
+            f"control is a drag, and {order_of(bar, 0.051)} for longer steps",
         ],
     }
     assert pendulum.MAX_SUBSTEPS == 1_000_000
