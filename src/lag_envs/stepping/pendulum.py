@@ -338,7 +338,7 @@ def truncation_bound(omega: float, coeffs: Coefficients, dt: float, order: int =
     h = dt / n
     # One step needs the bound only at its start, several need it throughout.
     x = min(least_majorant(omega, coeffs, dt), largest) if one else _rate(omega, *coeffs, dt) * h
-    left_out = tail(x, order) * (1.0 if one else n / LOSS)
+    left_out = tail(x, order) * (1.0 if one else n / LOSS)  # the bound of substeps has no such factor
     return Bound(int(n), order, left_out / (order + 2), left_out / h)
 
 

@@ -117,7 +117,7 @@ class PendulumExact(_Rod):
 
     id = "PendulumExact-v0"
     peer = "Pendulum-v1"
-    order = 20  # with 16, one step in fourteen is divided, for random torques turn the rod fast
+    order = 20  # random torques turn the rod fast: with 16, six steps in a hundred are divided
     quantities = {
         **_Rod.direction,
         "theta_dot": ("rad/s", "angular velocity, clipped at 8"),
