@@ -43,8 +43,8 @@ def measure_orders(
     envs = LagrangianVectorEnv(task, num_envs)
     if envs.order is None:
         raise UserError(
-            f"{task.__name__} has a flow of its own, as {type(envs.scene).__name__} moves like a pendulum or on "
-            "a slope: only orders of the general series are measured"
+            f"{task.__name__} has a flow of its own, as {type(envs.scene).__name__} moves like a pendulum or "
+            "on a slope: only orders of the general series are measured"
         )
     envs.reset(seed=0)
     envs.action_space.seed(0)

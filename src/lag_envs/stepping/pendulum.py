@@ -43,7 +43,7 @@ from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
 ORDER = 16
 TOLERANCE = 1e-12
-#: Factor of the bound of one series of order 6 or more, for all other poles of the tangent: 1.2426, rounded up.
+#: Factor of the bound of one series of order 6 or more, for the tangent's other poles: 1.2426, rounded up.
 LOSS = 1.25
 MAX_SUBSTEPS = 1_000_000
 #: Substeps compute the coefficients up to this one with twice the digits. Rounding errors of later ones are
