@@ -160,14 +160,22 @@ class Certificate:
 
     def _measure(self) -> None:
         """Find the norms Σ' of all slots, and the overlaps H of all pairs."""
-        t, order, pairs = self._t, self._order, self._series.distinct_pairs
+        t, order, most = self._t, self._order, self._t.group
         self._norms: dict[int, Any] = {}
         self._overlaps: dict[tuple[Factor, Factor], Any] = {}
-        for first in range(0, len(pairs), t.group):
-            self._measure_pairs(pairs[first : first + t.group])
+        pairs = self._series.distinct_pairs
+        n = -(-len(pairs) // most)
+        groups = [pairs[i * len(pairs) // n : (i + 1) * len(pairs) // n] for i in range(n)]
+        # A group's sums wait in memory while the registers are needed for the next group's.
+        waiting = [t.aside(self._measure_pairs(group)) for group in groups[:-1]]
+        sums = [self._measure_pairs(group) for group in groups[-1:]]
+        for group, found in zip(groups, [*(back() for back in waiting), *sums], strict=True):
+            upper = _factors(group, 1)
+            self._norms |= {b.slot: s for b, s in zip(upper, found, strict=False)}
+            self._overlaps |= dict(zip(group, found[len(upper) :], strict=True))
         alone = [slot for slot in range(self._series.slots) if slot not in self._norms]
-        for first in range(0, len(alone), t.group):
-            some = alone[first : first + t.group]
+        for first in range(0, len(alone), most):
+            some = alone[first : first + most]
 
             def accumulate(k: Any, carried: Sequence, some: Sequence = some) -> list:
                 return [t.add(total, self._size(slot, k)) for slot, total in zip(some, carried, strict=True)]
@@ -175,10 +183,10 @@ class Certificate:
             totals = t.loop(t.index(1), order, [t.number(0.0)] * len(some), accumulate)
             self._norms |= dict(zip(some, totals, strict=True))
 
-    def _measure_pairs(self, pairs: Sequence[tuple[Factor, Factor]]) -> None:
-        """Sum |A_j| times the sum of |B_m| over m >= N - j."""
+    def _measure_pairs(self, pairs: Sequence[tuple[Factor, Factor]]) -> list:
+        """Sum |B_m| for each B, and for each pair |A_j| times the sum of |B_m| over m >= N - j."""
         t, order = self._t, self._order
-        lower, upper = (list(dict.fromkeys(pair[i] for pair in pairs)) for i in (0, 1))
+        lower, upper = _factors(pairs, 0), _factors(pairs, 1)
 
         def accumulate(j: Any, carried: Sequence) -> list:
             other = t.minus(order, j)
@@ -187,9 +195,7 @@ class Certificate:
             totals = zip(pairs, carried[len(upper) :], strict=True)
             return [*sums.values(), *(t.fma(x[a], sums[b], total) for (a, b), total in totals)]
 
-        found = t.loop(t.index(1), order, [t.number(0.0)] * (len(upper) + len(pairs)), accumulate)
-        self._norms |= {b.slot: s for b, s in zip(upper, found, strict=False)}
-        self._overlaps |= dict(zip(pairs, found[len(upper) :], strict=True))
+        return t.loop(t.index(1), order, [t.number(0.0)] * (len(upper) + len(pairs)), accumulate)
 
     def _overlap(self, key: Any) -> Any:
         return self._powered(self._overlaps[self._series.pairs[key]])
@@ -316,3 +322,8 @@ class Certificate:
         grown = t.fma(t.mul(b, b), t.number(1.3333333333333335), t.number(1.0))
         self._tails[args[1]] = t.mul(grown, t.fma(b, a, other))
         return t.mul(grown, t.fma(b, other, a))
+
+
+def _factors(pairs: Sequence[tuple[Factor, Factor]], side: int) -> list[Factor]:
+    """Return the distinct factors on one side of pairs."""
+    return list(dict.fromkeys(pair[side] for pair in pairs))

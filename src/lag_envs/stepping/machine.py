@@ -198,6 +198,20 @@ class Machine:
     def store(self, slot: int, k: Any, value: Any) -> None:
         self._b.store(value, self._at(slot, k))
 
+    def aside(self, values: Sequence) -> Callable[[], list]:
+        # Left to itself, LLVM keeps the results of a loop in registers, and spills the next loop's own sums.
+        b, void = self._b, ir.VoidType()
+        with b.goto_entry_block():
+            places = b.alloca(self.kind, len(values))
+            places.align = 8 * self._lanes
+        at = [b.gep(places, [ir.Constant(_INT, i)]) for i in range(len(values))]
+        for place, value in zip(at, values, strict=True):
+            b.store(value, place)
+        # For all that LLVM knows, this changes what lies there; it is no instruction.
+        kind = ir.FunctionType(void, [places.type])
+        b.call(ir.InlineAsm(kind, "", "r,~{memory}", side_effect=True), [places])
+        return lambda: [b.load(place) for place in at]
+
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
         b = self._b
         start = b.basic_block

@@ -407,6 +407,9 @@ class Script:
     def store(self, slot: int, k: Any, value: Any) -> None:
         self.say("write", "m", self._at(slot, k), value)
 
+    def aside(self, values: Sequence) -> Callable[[], list]:
+        return lambda: list(values)
+
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
         names, k = self._vary(carried), self._new("k")
         written = self._inside(lambda: self._change(names, body(k, list(names))))

@@ -54,6 +54,10 @@ class Target(Protocol):
     ----------
     group : int
         How many products are summed side by side in one loop. Results do not depend on it.
+
+    Notes
+    -----
+    `aside` may move numbers to memory, and returns a function that brings them back.
     """
 
     group: int
@@ -82,6 +86,7 @@ class Target(Protocol):
     def below(self, a: Any, b: Any) -> Any: ...
     def load(self, slot: int, k: Any) -> Any: ...
     def store(self, slot: int, k: Any, value: Any) -> None: ...
+    def aside(self, values: Sequence) -> Callable[[], list]: ...
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list: ...
     def repeat(self, times: int, carried: Sequence, body: Callable) -> list: ...
     def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list: ...
@@ -171,6 +176,9 @@ class Plain:
 
     def store(self, slot: int, k: int, value: Any) -> None:
         self._memory[slot][k] = value
+
+    def aside(self, values: Sequence) -> Callable[[], list]:
+        return lambda: list(values)
 
     def loop(self, first: int, end: int, carried: Sequence, body: Callable, step: int = 1) -> list:
         values = list(carried)
