@@ -233,6 +233,9 @@ def test_mpc_for_any_task():
     for name in ("horizon", "every", "guesses", "budget", "finer"):
         with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
             MPC(task, **{name: 0})
+    for reserve in (-0.1, 1.0, math.nan):
+        with pytest.raises(ValueError, match=f"reserve must be at least 0 and less than 1, got {reserve}"):
+            MPC(task, reserve=reserve)
     assert build(task, "zero") is not None
 
 

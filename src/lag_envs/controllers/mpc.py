@@ -69,6 +69,8 @@ class MPC:
     finer : int
         Calls of `predict` in a step of the task: between a plan's steps its action is held, but the feedback
         acts at each call.
+    reserve : float
+        Share of the largest action that plans leave to their feedback.
     plans : Plans, optional
         Specifies the feedback along plans made from `first`; by default `Task.plans`.
     hold : Tracking, optional
@@ -95,6 +97,7 @@ class MPC:
         surprise: float = 1e-3,
         easier: tuple[Task, Tail | None] | None = None,
         finer: int = 1,
+        reserve: float = 0.0,
         plans: Plans | None = None,
         hold: Any = None,
         holds: Callable[[Array], NDArray[np.bool_]] | None = None,
@@ -109,6 +112,8 @@ class MPC:
         ):
             if number < 1:
                 raise ValueError(f"{name} must be at least 1, got {number}")
+        if not 0.0 <= reserve < 1.0:
+            raise ValueError(f"reserve must be at least 0 and less than 1, got {reserve}")
         if first and task.plans is None:
             raise ValueError(f"first: {type(task).__name__} has no `plans`, which specify the feedback")
         for guess in first:
@@ -134,6 +139,8 @@ class MPC:
         searched, end = easier or (calm, tail)
         rounds = max(budget // (guesses * horizon * len(SHARES)), 1)
         self.searcher = ILQR(searched, [], tail=end, steps=horizon, iterations=rounds, tolerance=1e-2)
+        for method in (self.planner, self.polisher, self.searcher):
+            method.largest *= 1.0 - reserve
         self.share = np.asarray(searched.limit_control / task.limit_control)
 
     def predict(

@@ -291,7 +291,7 @@ class AcrobotReal(Task):
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
         "MPC": Controller(
             "lag_envs.controllers.mpc:renewed",
-            {"finer": 5, "every": 5, "iterations": 3, "surprise": math.inf},
+            {"finer": 5, "every": 5, "iterations": 3, "surprise": math.inf, "reserve": 0.05},
             plans=True,
         ),
     }
@@ -421,7 +421,7 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (AcrobotReal's docstring, adapted
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
         "MPC": Controller(
             "lag_envs.controllers.mpc:renewed",
-            {"finer": 5, "every": 2, "iterations": 3, "surprise": math.inf},
+            {"finer": 5, "every": 2, "iterations": 3, "surprise": math.inf, "reserve": 0.05},
             plans=True,
         ),
     }
