@@ -345,9 +345,9 @@ class AcrobotReal(Task):
         "does not swing up hanging ones. The plan was found on the exact model with friction; its feedback "
         "comes from a model without dry friction. MPC begins with that plan or its mirror image, and renews "
         "it on the way up, which brings the links up sooner. It is fast enough on average, but a single "
-        "renewal takes as long as many steps, and with wrong parameters it is no more reliable than the plan. "
-        "Learners stay below the plan on average, and their seeds differ much. TD3, SAC and TQC hold their "
-        "noise for many steps. The PPO in one file takes many more steps, and less time."
+        "renewal takes as long as many steps; and with wrong parameters MPC is no more reliable than the "
+        "plan. Learners stay below the plan on average, and their seeds differ much. TD3, SAC and TQC hold "
+        "their noise for many steps. The PPO in one file takes many more steps, and less time."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
