@@ -12,10 +12,10 @@ from covering import slow
 from agents import optimum, plans
 from lag_envs.controllers import build, make_controller
 from lag_envs.controllers.basic import Constant, ObservationDecoder, feedback
-from lag_envs.controllers.chain import loss, replan
+from lag_envs.controllers.chain import replan
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
-from lag_envs.controllers.mpc import MPC, without_kicks
+from lag_envs.controllers.mpc import MPC, loss, without_kicks
 from lag_envs.controllers.tracking import Tracking, follow, hold, recorded, search
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import Rollout, play, record_rollout
@@ -230,10 +230,20 @@ def test_mpc_for_any_task():
     agent = MPC(task, horizon=25, iterations=1, guesses=4, budget=2_000)
     returns = play(pivoted_bar.Balance.id, agent, SEEDS[:4], duration=1.0)
     assert returns.mean() > 40.0  # of 50; doing nothing gets half of that
-    for name in ("horizon", "every", "guesses", "budget"):
+    for name in ("horizon", "every", "guesses", "budget", "finer"):
         with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
             MPC(task, **{name: 0})
+    for reserve in (-0.1, 1.0, math.nan):
+        with pytest.raises(ValueError, match=f"reserve must be at least 0 and less than 1, got {reserve}"):
+            MPC(task, reserve=reserve)
     assert build(task, "zero") is not None
+
+
+def test_no_plan_is_longer_than_an_episode():
+    task = chain.SwingUp(duration=0.4)
+    agent, start = build(task, "MPC"), ObservationDecoder(task).expected(np.array([task.centre]))[0]
+    action, plan = agent.predict(start.astype(np.float32))
+    assert plan.states.shape == (1, 20, 6) and np.abs(action).max() <= 1.0
 
 
 # --- from a recorded plan ---

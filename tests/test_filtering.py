@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from lag_envs.controllers import build, make_controller
 from lag_envs.controllers.basic import ObservationDecoder, constant
 from lag_envs.controllers.filtering import Filtered
-from lag_envs.evaluation.rollout import Rollout
+from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.chain import SwingUpTripleNoisy
 from lag_envs.tasks.registration import make_task
@@ -58,6 +59,30 @@ def test_an_episode_that_begins_is_believed_anew():
     _, single = agent.predict(second[1])
     assert (known.state[1] == again.state[1]).all() and (known.state[0] != again.state[0]).any()
     assert np.abs(single.state[0] - again.state[1]).max() <= 1e-15
+
+
+def test_plans_are_renewed_by_each_estimate_alone():
+    """Also those of an episode that begins while another's plan is under way."""
+    task, rng = TASKS[SwingUpTripleNoisy.id](), np.random.default_rng(0)
+    agents = [build(task, "filter + MPC", every=3) for _ in range(2)]
+    seen = ObservationDecoder(task).expected(np.array([task.centre]))[0] + rng.normal(0.0, 0.008, (12, 2, 11))
+    memory = own = None
+    for k, both in enumerate(seen.astype(np.float32)):
+        actions, memory = agents[0].predict(both, memory, np.array([k == 0, k in (0, 5)]))
+        alone, own = agents[1].predict(both[1], own if k != 5 else None, k in (0, 5))
+        assert np.abs(actions[1] - alone).max() <= 1e-6
+    assert memory.memory.step.tolist() == [3, 1]
+    assert agents[0].controller.plans.effort == 1.0 > task.plans.effort
+
+
+@pytest.mark.slow
+def test_renewing_gently_is_no_worse_than_following():
+    env_id, seeds = SwingUpTripleNoisy.id, range(2_000_001_000, 2_000_001_096)
+    followed, renewed = (
+        play(env_id, make_controller(env_id, f"filter + {name}"), seeds) for name in ("plan + TVLQR", "MPC")
+    )
+    # The mean difference of so many has a standard deviation of 13.
+    assert renewed.mean() > followed.mean()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from covering import covering, every, slow
 from rollouts import actions, make
 
 from lag_envs.controllers import ILQR, build, make_controller
-from lag_envs.controllers.basic import Constant
+from lag_envs.controllers.basic import Constant, ObservationDecoder
 from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
@@ -234,6 +234,52 @@ def test_the_published_regulator_holds_the_real_pendulum(kind):
 def test_recorded_plans_swing_up(env_id):
     returns = play(env_id, make_controller(env_id, "plan + TVLQR"), range(20))
     assert returns.mean() == pytest.approx(best(env_id), rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "gain"), [(AcrobotReal, 1.7), (PendubotReal, 1.0)])
+def test_renewing_the_recorded_plan_is_better(kind, gain):
+    followed, renewed = (
+        play(kind.id, make_controller(kind.id, name), range(3)) for name in ("plan + TVLQR", "MPC")
+    )
+    assert (renewed > followed + gain).all()
+
+
+def test_renewed_plans_are_the_same_alone_and_after_a_restart():
+    task = make_task(PendubotReal.id)
+    agents, read, model = [build(task, "MPC") for _ in range(2)], ObservationDecoder(task), Model(task)
+    states, memory, own = np.array([task.centre, [0.03, -0.02, 0.01, 0.04]]), None, None
+    for k in range(26):
+        if k == 13:
+            states[1] = [-0.02, 0.01, 0.03, 0.0]  # another episode begins in the middle of the first's
+        seen = read.expected(states)[0].astype(np.float32)
+        actions, memory = agents[0].predict(seen, memory, np.array([k == 0, k in (0, 13)]))
+        alone, own = agents[1].predict(seen[0], own, k == 0)
+        assert (actions[0] == alone).all()
+        if k == 13:
+            assert (actions[1] == build(task, "MPC").predict(seen[1])[0]).all()
+        states = model(states, actions[:, 0])[0]
+    # Plans leave a twentieth of the torque to their feedback.
+    assert 0.9 < np.abs(memory.actions).max() <= 0.95
+    # Every second of its steps a plan is renewed, each of them five calls long.
+    assert memory.step.tolist() == [6, 3]
+
+
+def test_between_the_steps_of_a_plan_feedback_acts_on_the_line_between_its_states():
+    task = make_task(PendubotReal.id)
+    agent, read = build(task, "MPC", every=3), ObservationDecoder(task)
+    assert agent.task.dt == pytest.approx(5 * task.dt) and agent.horizon == round(1.1 * 425 / 5)
+    rows, x = np.arange(1), np.array([[0.01, 0.02, -0.03, 0.0]])
+    _, plan = agent.predict(read.expected(x)[0].astype(np.float32))
+    line = 0.6 * plan.states[0, 1] + 0.4 * plan.states[0, 2]
+    move = np.array([1e-3, 0.0, 2e-3, 0.0])
+    later = plan._replace(step=np.array([7]))
+    off, _ = agent._followed(later, rows, later.step, line[None] + move)
+    np.testing.assert_allclose(off[0], move, atol=1e-12)
+    action, after = agent.predict(read.expected(line[None] + move)[0].astype(np.float32), later)
+    expected = plan.actions[0, 1] + plan.gains[0, 1] @ move
+    np.testing.assert_allclose(action[0], np.clip(expected, -1.0, 1.0), atol=1e-4)
+    assert after.step[0] == 8 and (after.actions == plan.actions).all()
 
 
 # --- an optimum that is proved ---

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, remade
+from lag_envs.controllers.basic import Array, remade
 from lag_envs.controllers.ilqr import ILQR
-from lag_envs.controllers.linear import BalanceLQR, regulator
-from lag_envs.controllers.mpc import MPC, without_kicks
+from lag_envs.controllers.linear import BalanceLQR
+from lag_envs.controllers.mpc import MPC, held, loss, without_kicks
 from lag_envs.controllers.tracking import Tracking, hold, recorded
 from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
@@ -83,20 +83,6 @@ def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1
     return ILQR(task, guesses, after=hold(task), tail=loss(task), steps=ahead)
 
 
-def loss(task: SwingUp) -> Callable[[Array], Array]:
-    """Return the best regulator's loss of reward from given states, near upright; farther off, more."""
-    read, rest = ObservationDecoder(task), np.array(task.plans.rest)
-    # The reward ignores where on the track the bars stand; something has to draw the support back.
-    _, cost = regulator(task, rest, extra={"s": 0.02 / task.length**2})
-
-    def lost(states: Array) -> Array:
-        off = read.difference(states, rest)
-        loss = np.einsum("...i,ij,...j->...", off, cost, off)
-        return loss + loss**2  # the control is limited: where much is to be lost, all is
-
-    return lost
-
-
 def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: Any) -> MPC:
     """Return an MPC that plans at the start and after each kick, and leaves holding to a regulator.
 
@@ -115,42 +101,6 @@ def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: 
     return held(
         task, horizon=horizon, good=good, easier=easy, **({"every": horizon, "iterations": 6} | numbers)
     )
-
-
-def renewed(task: SwingUp, *, beyond: float = 1.1, iterations: int = 1, **numbers: Any) -> MPC:
-    """Return an MPC that begins with a recorded plan, renews it in time, and leaves holding to a regulator.
-
-    Parameters
-    ----------
-    task : SwingUp
-        The task, ``env.unwrapped.task``. Each episode begins with one of its recorded plans, or its image.
-    beyond : float
-        How far to plan, as a multiple of the longest recorded plan.
-    iterations : int
-        Iterations of iLQR for a renewal.
-    **numbers
-        Other arguments of `MPC`, and of `held`.
-    """
-    plans = [recorded(task, kind) for kind in (["followed", "quick"] if task.quick else ["followed"])]
-    horizon = round(beyond * max(len(plan.actions) for plan in plans) * task.interval / task.dt)
-    first = [*plans, *(plan.mirrored() for plan in plans)]
-    return held(task, first=first, horizon=horizon, iterations=iterations, **numbers)
-
-
-def held(task: SwingUp, *, near: float = 0.5, **numbers: Any) -> MPC:
-    """Return an MPC whose final cost is a regulator's loss, and which leaves holding to a regulator.
-
-    Parameters
-    ----------
-    task : SwingUp
-        The task, ``env.unwrapped.task``.
-    near : float
-        Loss below which the regulator is in charge.
-    **numbers
-        Other arguments of `MPC`.
-    """
-    lost = loss(task)
-    return MPC(task, lost, hold=hold(task), holds=lambda states: lost(states) < near, **numbers)
 
 
 def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **numbers: Any) -> MPC:

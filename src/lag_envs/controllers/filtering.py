@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, ObservationDecoder
+from lag_envs.controllers.mpc import renewed
 from lag_envs.controllers.tracking import follow, recorded
 from lag_envs.envs.model import Model
 from lag_envs.scenes.derivation import form_of
@@ -128,3 +129,18 @@ def follow_filtered(task: Task, *, effort: float, drift: float) -> Filtered:
     """
     plan, plans = recorded(task), dataclasses.replace(task.plans, effort=effort)
     return Filtered(task, follow(task, plan.states, plan.actions, plans), drift=drift)
+
+
+def renewed_filtered(task: Task, *, drift: float, **numbers: Any) -> Filtered:
+    """Return a controller that renews a task's recorded plan by the estimate.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``.
+    drift : float
+        As in `Filtered`.
+    **numbers
+        Arguments of `lag_envs.controllers.mpc.renewed`.
+    """
+    return Filtered(task, renewed(task, **numbers), drift=drift)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names
+from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names, remade
 from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
-from lag_envs.controllers.linear import time_varying
+from lag_envs.controllers.linear import regulator, time_varying
 from lag_envs.controllers.swing_up import away
-from lag_envs.controllers.tracking import Tracking, smoothed, waves
+from lag_envs.controllers.tracking import Tracking, hold, recorded, smoothed, waves
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Plans
+from lag_envs.tasks.track import GuardedTrack
 
 Tail = Callable[[Array], Array]
 
@@ -21,7 +24,7 @@ Tail = Callable[[Array], Array]
 class Ahead(NamedTuple):
     """The plan of each episode: its step, and for each of its steps state, action and gain."""
 
-    step: NDArray[np.intp]  # (n,)
+    step: NDArray[np.intp]  # (n,), in calls of `predict`
     wait: NDArray[np.intp]  # (n,), steps until the next search is allowed
     states: Array  # (n, horizon, n_state)
     actions: Array  # (n, horizon, n_actions)
@@ -43,7 +46,7 @@ class MPC:
     tail : callable, optional
         Final cost of a plan, from states (n, n_state) to numbers (n,).
     horizon : int
-        Steps to plan ahead.
+        Steps to plan ahead, but at most those of an episode.
     first : sequence of Tracking
         Recorded plans of the task, from which each episode's first plan is made. With these, nothing is
         searched for at the start, and all plans are followed by the feedback that `Task.plans` specifies.
@@ -63,6 +66,13 @@ class MPC:
         Deviation of an entry of the state from the plan that counts as a surprise.
     easier : (Task, callable), optional
         A task for searches, and its final cost: see `Plans.place`.
+    finer : int
+        Calls of `predict` in a step of the task: between a plan's steps its action is held, but the feedback
+        acts at each call.
+    reserve : float
+        Share of the largest action that plans leave to their feedback.
+    plans : Plans, optional
+        Specifies the feedback along plans made from `first`; by default `Task.plans`.
     hold : Tracking, optional
         Feedback that continues a plan beyond its end, and that acts where `holds`.
     holds : callable, optional
@@ -86,6 +96,9 @@ class MPC:
         pause: int = 10,
         surprise: float = 1e-3,
         easier: tuple[Task, Tail | None] | None = None,
+        finer: int = 1,
+        reserve: float = 0.0,
+        plans: Plans | None = None,
         hold: Any = None,
         holds: Callable[[Array], NDArray[np.bool_]] | None = None,
         seed: int = 0,
@@ -94,10 +107,13 @@ class MPC:
             ("horizon", horizon),
             ("every", every),
             ("guesses", guesses),
+            ("finer", finer),
             ("budget", budget),
         ):
             if number < 1:
                 raise ValueError(f"{name} must be at least 1, got {number}")
+        if not 0.0 <= reserve < 1.0:
+            raise ValueError(f"reserve must be at least 0 and less than 1, got {reserve}")
         if first and task.plans is None:
             raise ValueError(f"first: {type(task).__name__} has no `plans`, which specify the feedback")
         for guess in first:
@@ -106,8 +122,10 @@ class MPC:
                     f"first: a plan for {guess.task.scene} cannot guide {type(task).__name__} with "
                     f"{task.scene}; take plans that were made for this task, as `recorded(task)` is"
                 )
-        self.task, self.horizon, self.every = task, horizon, min(every, horizon)
-        self.first = first
+        horizon = int(min(horizon, task.limit))
+        self.task, self.horizon, self.finer = task, horizon, finer
+        self.every, self.over = min(every, horizon) * finer, horizon * finer
+        self.first, self.plans = first, plans or task.plans
         self.model = smoothed(task) if first else task
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
@@ -121,6 +139,8 @@ class MPC:
         searched, end = easier or (calm, tail)
         rounds = max(budget // (guesses * horizon * len(SHARES)), 1)
         self.searcher = ILQR(searched, [], tail=end, steps=horizon, iterations=rounds, tolerance=1e-2)
+        for method in (self.planner, self.polisher, self.searcher):
+            method.largest *= 1.0 - reserve
         self.share = np.asarray(searched.limit_control / task.limit_control)
 
     def predict(
@@ -143,19 +163,16 @@ class MPC:
         plan.wait[:] = np.where(fresh, 0, np.maximum(plan.wait - 1, 0))
         plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = self.idle, 0.0, x[fresh, None]
         rows, held = np.arange(n), np.zeros(n, np.bool_) if self.holds is None else self.holds(x)
-        now = np.minimum(plan.step, self.horizon - 1)
-        off = np.abs(self.read.difference(x, plan.states[rows, now])).max(axis=1)
+        off = np.abs(self._followed(plan, rows, plan.step, x)[0]).max(axis=1)
         renewed = ~held & (fresh | (plan.step >= self.every) | (off > self.surprise))
         if renewed.any():
             self._renew(plan, np.flatnonzero(renewed), x, targets, fresh)
-        now = np.minimum(plan.step, self.horizon - 1)
-        off = self.read.difference(x, plan.states[rows, now])
-        action = plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
+        _, action = self._followed(plan, rows, plan.step, x)
         if held.any():
             action = np.where(held[:, None], self._holding(x, targets), action)
-        plan.step[:] = np.where(held, self.horizon, plan.step + 1)
-        action = np.clip(action, -self.largest, self.largest).astype(np.float32)
-        return action.reshape(*values.shape[:-1], self.count), plan
+        plan.step[:] = np.where(held, self.over, plan.step + 1)
+        clipped = np.clip(action, -self.largest, self.largest).astype(np.float32)
+        return clipped.reshape(*values.shape[:-1], self.count), plan
 
     def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
         """Plan again for some of the episodes."""
@@ -185,15 +202,20 @@ class MPC:
             getattr(plan, name)[rows] = getattr(found, name)
         plan.step[rows] = 0
 
+    def _followed(self, plan: Ahead, rows: Any, step: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
+        """Return how far states (n, n_state) are off plans at some of their steps, and the actions."""
+        now, part = np.divmod(np.minimum(step, self.over - self.finer), self.finer)
+        planned, after = (plan.states[rows, i] for i in (now, np.minimum(now + 1, self.horizon - 1)))
+        off = self.read.difference(x, planned + (part / self.finer)[:, None] * (after - planned))
+        return off, plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
+
     def _following(self, plan: Ahead, rows: NDArray[np.intp]) -> Feedback:
         """Return the feedback that follows plans to their ends, and holds there."""
 
         def act(x: Array, targets: Array, t: int) -> Array:
-            step = plan.step[rows] + t
-            now = np.minimum(step, self.horizon - 1)
-            off = self.read.difference(x, plan.states[rows, now])
-            action = plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
-            over = (step >= self.horizon)[:, None]
+            step = plan.step[rows] + t * self.finer
+            _, action = self._followed(plan, rows, step, x)
+            over = (step >= self.over)[:, None]
             if not over.any():
                 return action
             return np.where(over, self.idle if self.hold is None else self._holding(x, targets), action)
@@ -223,7 +245,7 @@ class MPC:
     def _gains(self, states: Array, actions: Array) -> Array:
         """Return the feedback (n, horizon, n_actions, n_state) along plans: that along recorded ones."""
         n, width = len(states), states.shape[-1]
-        plans, gains = self.task.plans, np.empty((n, self.horizon, self.count, width))
+        plans, gains = self.plans, np.empty((n, self.horizon, self.count, width))
         for i in range(n):
             acted = actions[i, :, 0] if self.count == 1 else actions[i]
             ended = np.append(states[i], [plans.rest], axis=0)  # the end itself does not matter
@@ -280,6 +302,76 @@ def planner(
     for what, given in (("weights", weights), ("rest", rest)):
         check_names(what, given or {}, task.scene.state_names)
     return MPC(task, away(task, weights, rest or {}) if weights else None, **numbers)
+
+
+def loss(task: Task) -> Callable[[Array], Array]:
+    """Return the best regulator's loss of reward from given states, near upright; farther off, more."""
+    read, rest = ObservationDecoder(task), np.array(task.plans.rest)
+    # Rewards ignore where on the track a support stands; something has to draw it back.
+    extra = {"s": 0.02 / task.length**2} if isinstance(task, GuardedTrack) else {}
+    _, cost = regulator(smoothed(task), rest, extra=extra)
+
+    def lost(states: Array) -> Array:
+        off = read.difference(states, rest)
+        loss = np.einsum("...i,ij,...j->...", off, cost, off)
+        return loss + loss**2  # the control is limited: where much is to be lost, all is
+
+    return lost
+
+
+def renewed(
+    task: Task,
+    *,
+    beyond: float = 1.1,
+    iterations: int = 1,
+    finer: int = 1,
+    effort: float | None = None,
+    **numbers: Any,
+) -> MPC:
+    """Return an MPC that begins with a recorded plan, renews it in time, and leaves holding to a regulator.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``. Each episode begins with one of its recorded plans, or its image.
+    beyond : float
+        How far to plan, as a multiple of the longest recorded plan.
+    iterations : int
+        Iterations of iLQR for a renewal.
+    finer : int
+        Steps of the task in a step of the plan, see `MPC`.
+    effort : float, optional
+        Weight of an action's deviation from the plan or from rest; by default that of `Task.plans`.
+    **numbers
+        Other arguments of `MPC`, and of `held`.
+    """
+    plans = task.plans if effort is None else dataclasses.replace(task.plans, effort=effort)
+    laws = [recorded(task, kind) for kind in (["followed", "quick"] if plans.quick else ["followed"])]
+    first = [*laws, *(law.mirrored() for law in laws)]
+    if finer > 1:
+        task = remade(task, dt=finer * task.dt)
+    horizon = round(beyond * max(len(law.actions) for law in laws) * task.interval / task.dt)
+    return held(
+        task, plans=plans, first=first, horizon=horizon, iterations=iterations, finer=finer, **numbers
+    )
+
+
+def held(task: Task, *, near: float = 0.5, plans: Plans | None = None, **numbers: Any) -> MPC:
+    """Return an MPC whose final cost is a regulator's loss, and which leaves holding to a regulator.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``.
+    near : float
+        Loss below which the regulator is in charge.
+    plans : Plans, optional
+        Specifies the regulator, and the feedback along plans; by default `Task.plans`.
+    **numbers
+        Other arguments of `MPC`.
+    """
+    lost, holding = loss(task), hold(task, plans)
+    return MPC(task, lost, plans=plans, hold=holding, holds=lambda states: lost(states) < near, **numbers)
 
 
 def without_kicks(task: Task) -> Task:

@@ -144,9 +144,10 @@ def recorded(task: Task, kind: str = "followed") -> Tracking:
     return Tracking.load(task, plan_file(task, kind))
 
 
-def hold(task: Task) -> Tracking:
-    """Return the regulator that holds the end of a task's plans, as `Task.plans` specifies."""
-    return follow(task, [task.plans.rest], np.empty(0), task.plans)
+def hold(task: Task, plans: Plans | None = None) -> Tracking:
+    """Return the regulator that holds the end of plans, as `Task.plans` specifies, or others."""
+    plans = plans or task.plans
+    return follow(task, [plans.rest], np.empty(0), plans)
 
 
 def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
