@@ -67,7 +67,7 @@ class Settings(LearnerSettings):
     vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
     max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
     reward_scale: float = Field(ge=0, description="factor of the rewards")
-    episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
+    episode_share: float = Field(gt=0, le=1, description="share of its length at which an episode is cut")
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which that noise is held")
     log_std_init: float = Field(ge=-20, le=5, description="its log standard deviation at the start")

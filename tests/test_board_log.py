@@ -102,7 +102,7 @@ def test_a_damaged_line_is_named(board, line):
     board.log.write_bytes(board.log.read_bytes() + line.encode() + b"\n")
     add_another, withdraw = partial(add, board, "TQC"), partial(board.withdraw, next(iter(ids(board))), "x")
     for use in (board.read, add_another, withdraw, board.open, partial(board_data, board)):
-        with pytest.raises(BoardError, match=r"board.jsonl, line 3 is no event .* version control"):
+        with pytest.raises(BoardError, match=r"board.jsonl, line 3 is not an event .* version control"):
             use()
 
 
@@ -142,7 +142,7 @@ def rewritten(board, change):
         (lambda told: told[3].update(supersedes=["Gone"]), "line 4: .* not another result"),
         (lambda told: told[0].update(number=2), "line 1: protocol 2 begins where 1 would be the next"),
         (lambda told: told[1].update(protocol=2), "line 2: .* added under protocol 2, the current is 1"),
-        (lambda told: told[3].update(event="rejected"), "line 4 is no event"),
+        (lambda told: told[3].update(event="rejected"), "line 4 is not an event"),
     ],
 )  # fmt: skip
 def test_events_that_contradict_each_other(board, change, reason):

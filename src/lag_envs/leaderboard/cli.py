@@ -151,7 +151,7 @@ def run_leaderboard(args: argparse.Namespace) -> int:
         if args.action in ("add", "nonce"):
             board = "" if args.board == Path("leaderboard") else f" --board {shlex.quote(str(args.board))}"
             again = "the same command" if args.action == "add" else f"`lag-envs leaderboard add{board}`"
-            print(f"interrupted; what is done is kept, {again} goes on", file=sys.stderr)
+            print(f"interrupted; what is done is kept, {again} resumes", file=sys.stderr)
         raise
 
 
