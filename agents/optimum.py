@@ -52,8 +52,9 @@ SCHEMA, CACHED = 2, 1
 #: Number of episodes compared.
 EPISODES = 1_000
 
-HELP = """value iteration stores V_t, the largest return still attainable after t steps, at the nodes of a grid,
-and goes backwards from the end of the episode. It runs on several grids, each twice as fine as the one before.
+HELP = """value iteration stores V_t, the largest return still attainable after t steps, at the nodes of a
+grid, and goes backwards from the end of the episode. It runs on several grids, each twice as fine as the one
+before.
 
 what is written:
   agents/results/optimum/ID.json   numbers: bounds from below and from above, and how they were found

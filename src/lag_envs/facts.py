@@ -159,7 +159,7 @@ def _accuracy(task: Task) -> list[str]:
         shown, rate = math.floor(10.0 * speed) / 10.0, f"{layout_of(scene).free[0]}_dot"
         lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
     elif speed is not None:
-        lines += ["one substep is certified at no speed: the bound before each step decides how many are taken"]
+        lines += ["one substep is certified at no speed: the bound before each step decides their number"]
     if refused:
         lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
     return lines

@@ -13,8 +13,8 @@ order (sums termwise, products by convolution, functions by z' = w x'), with q_{
 with M_0⁻¹ found once, as numbers. docs/engine.md derives all of this.
 
 **Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
-above. The coefficients below N of every node, and v_N, are known. Suppose that those of the velocities beyond N
-sum up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut
+above. The coefficients below N of every node, and v_N, are known. Suppose that those of the velocities beyond
+N sum up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut
 after N - 1, the step is accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
