@@ -167,7 +167,7 @@ def test_mistakes(run):
     Path("torn").mkdir()
     Path("torn", "board.jsonl").write_text('{"event": "prot')
     status, _, err = run("list", "--board", "torn")
-    assert status == 2 and "board.jsonl has no line but a torn one; restore it from version control" in err
+    assert status == 2 and "board.jsonl has only a torn line; restore it from version control" in err
     write("a")
     run("add", "a", "--nonce", "n")
     other = incline.Tilt.id

@@ -133,7 +133,7 @@ class ILQR:
     def plan(self, starts: Array, targets: Array) -> tuple[Plan, Array]:
         """Return the best plan for each start (n, n_state) and target, and its return from `improve`.
 
-        Targets have the shape (n,), whether there are any or not, or (n, n_targets) if there are several.
+        Targets have the shape (n,), even if the task has none, or (n, n_targets) if there are several.
         """
         best: Plan | None = None
         most = np.full(len(starts), -math.inf)

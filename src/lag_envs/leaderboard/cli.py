@@ -308,7 +308,7 @@ def _some(board: Board) -> BoardState:
         raise
     if not state.entries:
         if parse(read_log(board.log))[1]:
-            raise BoardError(f"{board.log} has no line but a torn one; {REMEDY}")
+            raise BoardError(f"{board.log} has only a torn line; {REMEDY}")
         raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
     return state
 

@@ -320,9 +320,9 @@ class Task:
         Parameters
         ----------
         state, control : Values or sequence of numbers
-            As formulas have them, or numbers.
+            As in formulas, or numbers.
         xp : namespace
-            That of the formula; NumPy for numbers.
+            The formula's; NumPy for numbers.
 
         Returns
         -------
