@@ -135,7 +135,7 @@ def rewritten(board, change):
         (lambda told: told.pop(2), "line 3: .* nonce 'n', which is not its own"),
         (lambda told: told.insert(1, told.pop(2)), "line 3: .* is earlier than the line before it"),
         (lambda told: told.append(told[3]), "line 5: .* is verified, but was verified already"),
-        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* is there already, verified"),
+        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* is already there, verified"),
         (lambda told: told.append(told[2] | {"at": told[3]["at"]}), "line 5: the nonce 'n' was published"),
         (lambda told: told[3].update(nonce="other"), "line 4: .* which is not its own"),
         (lambda told: told[3].update(supersedes=[told[1]["id"]]), "line 4: .* not another result"),
@@ -175,7 +175,7 @@ def test_additions_of_two_clones_conflict(board, tmp_path):
     for how in ([], ["--union"]):  # a union would keep both, and break the chain
         merge = ["git", "merge-file", *how, "-p", str(a), str(base), str(b)]
         merged = subprocess.run(merge, capture_output=True).stdout
-        with pytest.raises(BoardError, match=r"line \d+ is (no event|not what followed)"):
+        with pytest.raises(BoardError, match=r"line \d+ is not (an event|what followed)"):
             parse(merged)
     shutil.copy(b, a)
     first = Board(first / "board")
