@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     p = module_parser(
         "agents.demo",
-        "Train a learner on an environment and evaluate it over 20 fresh episodes beside others.",
+        "Train a learner on an environment and compare it with other agents over 20 fresh episodes.",
         EPILOG,
     )
     p.add_argument(

@@ -61,7 +61,7 @@ OWN = {
     "cloning": ("agents.cloning", "cloning"),
 }
 LEARNERS = (*ALGORITHMS, *OWN)
-#: Learners whose policies come and go: the one that did best in a test is kept, in place of the last.
+#: Learners whose policies get better and worse: the one that did best in a test is kept, not the last.
 KEEP_BEST = (*OFF_POLICY, "dqn")
 #: Episodes of a test while training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100

@@ -105,7 +105,7 @@ def _optimal(env_id: str) -> Any:
 def _policy(env_id: str, folder: Path) -> Any:
     """Return a learner's policy as the board plays it.
 
-    Models of Stable-Baselines3 act alike to float32's rounding only, which chaotic motion makes much of.
+    A model of Stable-Baselines3 acts like it only to float32's rounding, which chaotic motion amplifies.
     """
     import torch
 
@@ -130,7 +130,7 @@ def learned_policy(env_id: str, folder: Path) -> Entrant:
 
 
 def check_alike(entrant: Entrant, first: Entrant) -> None:
-    """Raise a UserError if two runs of a learner were trained differently: they are not alike as samples."""
+    """Raise a UserError if runs were trained differently: they are not samples of the same learner."""
     assert entrant.run is not None and first.run is not None
     for name in ("steps", "hyperparameters"):
         if entrant.run[name] != first.run[name]:

@@ -52,38 +52,39 @@ SCHEMA, CACHED = 2, 1
 #: Number of episodes compared.
 EPISODES = 1_000
 
-HELP = """value iteration keeps V_t, the largest return still to be had with t steps taken, at the nodes of a
-grid and goes backwards from the end of the episode. It is done on grids each twice as fine as the one before.
+HELP = """value iteration stores V_t, the largest return still attainable after t steps, at the nodes of a
+grid, and goes backwards from the end of the episode. It runs on several grids, each twice as fine as the one
+before.
 
 what is written:
-  agents/results/optimum/ID.json   numbers: what is known from below and from above, and how
+  agents/results/optimum/ID.json   numbers: bounds from below and from above, and how they were found
   docs/images/value-ID.png         the value function at the start, where the best action changes sign
   FOLDER/ID/.../values.npy         all V_t, up to 1 GB each, 12 GB for all ids; may be deleted at any time
 
 how to read the numbers:
-  grid value    mean of V_0 over the starts of 1,000 fixed episodes. Interpolation makes it err, to either
-                side, the less the finer the grid.
+  grid value    mean of V_0 over the starts of 1,000 fixed episodes. Interpolation makes it too large or too
+                small; the finer the grid, the smaller the error.
   lower         mean return that the greedy policy really gets in those episodes, with the 95 % confidence
                 interval of a mean. A policy that gets it exists: the optimum is not below.
-  estimate      grid values extrapolated to cells without width, by the order of convergence that the last
-                three show; its error bar is what the last halving of the cells changed. An ESTIMATE, no
-                bound. There is none where its own greedy policy gets more.
-  bound         what no policy can exceed, proved; crude but where the optimum is known.
-A task with plans (`Task.plans`) is planned instead, by iLQR from random guesses, minutes per id:
+  estimate      grid values extrapolated to zero cell width, by the order of convergence that the last three
+                show; its error bar is the change by the last halving of the cells. It is an ESTIMATE, not a
+                bound. There is none if its own greedy policy gets more.
+  bound         proved upper bound on the return of any policy; crude unless the optimum is known.
+For a task with plans (`Task.plans`), plans are found instead, by iLQR from random guesses, in minutes per id:
   src/lag_envs/controllers/plans/ID-followed.npz
                 a plan that is followed from any start by feedback; of those found, the one with the best
                 mean return over 200 fresh starts
   src/lag_envs/controllers/plans/ID-quick.npz
                 a quicker one, from which each episode is replanned
   src/lag_envs/tasks/measured.json
-                what both get, by python -m agents.scale: means over fresh starts with standard errors; the
-                best of them is the best known, a lower bound
-With --quick plans of one seed are written to FOLDER and nothing is measured.
-Of a task with neither grid nor plans, the controllers and the best policy that ships with the package, or a
-run's, are measured by python -m agents.scale; with --quick nothing is written.
+                the returns of both, measured by python -m agents.scale: means over fresh starts with standard
+                errors; the better one is the best known return, a lower bound
+With --quick, plans of one seed are written to FOLDER and nothing is measured.
+For a task with neither grid nor plans, python -m agents.scale measures the controllers and the best policy of
+a run, or the one that ships with the package; with --quick nothing is written.
 
-Of a state of 4 dimensions an easier task is solved, such as the one without a track: its value is from above;
-lower is what the best agent gets, see the agents' results.
+If the state has 4 dimensions, an easier task is solved, such as the one without a track. Its value is an
+upper bound; lower is the return of the best agent, see the agents' results.
 
 It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): re-run it to resume from there.
 
@@ -448,7 +449,7 @@ def explanation(env_id: str, source: str, problem: ValueIteration, grids: Sequen
     text += (
         f" Values are means over the starts of {EPISODES:,} episodes. estimate: the grid values extrapolated "
         "to cells without width by the order of convergence that the last three show (between 1 and 2); its "
-        "error is what the last halving of the cells changed. It is no bound."
+        "error is what the last halving of the cells changed. It is not a bound."
     )
     if env_id != source:
         return text + (
@@ -458,7 +459,7 @@ def explanation(env_id: str, source: str, problem: ValueIteration, grids: Sequen
         )
     if problem.options:
         return text + (
-            " Solved is a relaxation: a track without ends, and no price for being off its middle, so the "
+            " An easier task is solved: a track without ends, and no cost for being off its middle, so the "
             "true optimum is lower. From below: the best policy known, see the results of the agents. The "
             "range between is too wide for a score in percent."
         )

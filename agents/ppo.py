@@ -67,7 +67,7 @@ class Settings(LearnerSettings):
     vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
     max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
     reward_scale: float = Field(ge=0, description="factor of the rewards")
-    episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
+    episode_share: float = Field(gt=0, le=1, description="share of its length at which an episode is cut")
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which that noise is held")
     log_std_init: float = Field(ge=-20, le=5, description="its log standard deviation at the start")
@@ -393,12 +393,12 @@ EPILOG = f"""what is left in FOLDER/ENV/{NAME}/seed<K>:
   model.zip            the network's weights: numpy.load reads it, agents.learners.load_policy plays it
   {CHECKPOINT}       while the run is not finished: everything needed to resume
 
-The same seed gives the same policy, bit for bit, also where the training was interrupted (by Ctrl-C or by a
-kill) and the command run again. Settings are those of `lag-envs hyperparams {NAME}`, where no option changes
+The same seed gives the same policy, bit for bit, even if the training was interrupted (by Ctrl-C or by a
+kill) and the command run again. Settings are those of `lag-envs hyperparams {NAME}`, unless an option changes
 them. `python -m agents.train ENV --algo {NAME}` trains several seeds side by side, or on a Ray cluster.
 
 examples:
-  python -m agents.ppo PivotedBar-v0                       one seed, in some seconds
+  python -m agents.ppo PivotedBar-v0                       one seed, in seconds
   python -m agents.ppo PivotedBar-v0 --seeds 5 --first-seed 10
   python -m agents.ppo PivotedBar-v0 --gamma 0.98 --actor 64 64 --output runs/wide
   python -m agents.ppo examples/ball_on_beam.py            a task of your own; this runs the file

@@ -44,16 +44,16 @@ ENV = "PivotedBar-v0"
 TESTS, EPISODES = 24, 100
 #: Heights of a small curve's characters, for scores from 0 to 1, and how many characters it has.
 HEIGHTS, WIDTH = "▁▂▃▄▅▆▇█", 16
-EPILOG = f"""Each training runs in a process of its own on one core, one after the other: with one seed every
-learner, then with the next. So whatever else the machine does disturbs all alike. There are two clocks. That
-of training counts nothing else; tests on {EPISODES} episodes stop it, {TESTS} times. The other is that of the
-whole process: imports, compiling, training, and one evaluation. Times on the processor do not count what
-others do on it.
+EPILOG = f"""Trainings run one after the other, each in its own process on one core: every learner with one
+seed, then every learner with the next. So other load on the machine disturbs all learners alike. There are
+two clocks. One counts only training; it stops during the {TESTS} tests on {EPISODES} episodes. The other
+counts the whole process: imports, compiling, training, and one evaluation. Processor time leaves out what
+other programs do.
 
 On a terminal a table shows each training while it runs. One that fails is named, and does not count.
 
-A level's time is that of the first test that reaches it; a training that never does counts as never. No
-training that ended is started again, and tests decide nothing.
+The time to a score is that of the first test that reaches it; it is infinite for a training that never does.
+A training that has ended is not started again. Tests do not influence training.
 
 examples:
   python -m agents.race                                            our PPO and Stable-Baselines3's, five seeds

@@ -32,7 +32,7 @@ FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
 #: What a checkpoint begins with; the digest of the rest follows.
 DIGEST = b"sha256:"
-#: Kinds of what is read of a result.
+#: Types of the entries that are read from a result.
 NUMBER = (int, float)
 KINDS: dict[str, Any] = {
     "env": str, "algo": str, "seed": int, "steps": int, "hyperparameters": dict, "trained": int,
@@ -251,7 +251,7 @@ def check_numbers(args: argparse.Namespace, **least: int) -> None:
 def check_writable(file: Path) -> None:
     """Raise a UserError for a file that cannot be written or grow, before hours of work on its content."""
     if file.exists() and not file.is_file():
-        raise UserError(f"{file} is no regular file: it cannot be kept for the next time")
+        raise UserError(f"{file} is not a regular file: it cannot be kept for the next time")
     try:
         folder = file.resolve().parent
         folder.mkdir(parents=True, exist_ok=True)

@@ -71,9 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument(
         "--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="learners' runs (default runs/)"
     )
-    p.add_argument(
-        "--output", type=new_file, metavar="FILE", help="keep the numbers as JSON, beside others' there"
-    )
+    p.add_argument("--output", type=new_file, metavar="FILE", help="add the numbers to this JSON file")
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or list(TASKS)
     for name in ("batches", "planned"):
@@ -164,7 +162,7 @@ def measure_environment(
                 returns = fast_returns(env_id, load(env_id), batches, size)
                 show(name, *mean_and_error(returns), len(returns), in_use.get(name))
                 continue
-            print(f"{env_id:28} {name:20} is not in {runs}; what was measured of it before stays", flush=True)
+            print(f"{env_id:28} {name:20} is not in {runs}; its earlier measurements stay", flush=True)
             found[name] = kept["measured"][name]
         elif name not in slow:
             agent = learners[name].make() if name in learners else make_controller(env_id, name)

@@ -52,11 +52,11 @@ class Settings(LearnerSettings):
     learning_rate: float = Field(ge=0, description="of the policy at the start; it falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
-    max_slope: float = Field(gt=0, description="largest norm of the derivatives by a state and action")
+    max_slope: float = Field(gt=0, description="largest norm of a step's derivatives")
     reward_scale: float = Field(ge=0, description="factor of the rewards")
-    episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
+    episode_share: float = Field(gt=0, le=1, description="share of its length at which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
-    start_ranges: dict[str, NonNegativeFloat] = Field(description="half widths of states about the usual")
+    start_ranges: dict[str, NonNegativeFloat] = Field(description="half widths of random starts")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
     critic: list[PositiveInt] = Field(description="widths of the critic's hidden layers; empty: no critic")
@@ -181,7 +181,7 @@ class Learner:
         return ExperienceWindow(*(np.stack(x) for x in zip(*steps, strict=True)))
 
     def gradients(self, w: ExperienceWindow) -> Array:
-        """Return the derivatives by each action of the discounted rewards that follow it, (T, n, n_actions).
+        """Differentiate the discounted rewards that follow an action with respect to it, (T, n, n_actions).
 
         They are with respect to the clipped actions. For an episode that is cut, the critic stands for the
         rest. Backwards in time, the derivatives with respect to x and a, a step's state and action, follow

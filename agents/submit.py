@@ -31,7 +31,7 @@ from lag_envs.options import module_parser
 
 Array = NDArray[np.float64]
 AUTHORS, LICENSE = ["the lag_envs authors"], "MIT"
-#: The folder of this file where everybody can read it.
+#: The public address of this file's folder.
 CODE = "https://github.com/lag-envs/lag-envs/blob/main/agents/"
 
 HELP = """submissions made, a folder each, in OUT:

@@ -193,7 +193,7 @@ def ranked_cells(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def pace(data: Mapping[str, Any]) -> float:
-    """Return how many steps a second of the processor trains, the median over all runs."""
+    """Return the steps trained per second of processor time, the median over all runs."""
     runs = [run for setting in data["settings"] for run in setting["runs"]]
     return float(np.median([run["trained"] / run["processor_seconds"] for run in runs]))
 
@@ -244,7 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n" + "\n".join(aligned(ranked_cells(data))))
         hours = 5 * 5e6 / pace(data) / 3600.0
         print(
-            f"{pace(data):,.0f} steps in a second of the processor, {hours:.2f} h for five seeds of 5M steps"
+            f"{pace(data):,.0f} steps per second of processor time, {hours:.2f} h for five seeds of 5M steps"
         )
         print(f"Written to {file}")
         return 1 if failed else 0

@@ -262,9 +262,9 @@ def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
 def test_a_file_that_cannot_be_written_is_named_before_the_work(command, arguments, tmp_path, capsys):
     taken = tmp_path / "taken"
     taken.write_text("{")
-    wrong = {taken / "new.png": "is no folder to write to", tmp_path: "is a folder"}
+    wrong = {taken / "new.png": "is not a writable folder", tmp_path: "is a folder"}
     if arguments[-1] == "--picture":
-        wrong = {taken / "new.png": "is no folder to write to", taken: "a picture's name ends with .png"}
+        wrong = {taken / "new.png": "is not a writable folder", taken: "a picture's name ends with .png"}
     for file, message in wrong.items():
         with pytest.raises(SystemExit) as left:
             command.main([*arguments, str(file)])

@@ -363,7 +363,7 @@ def test_a_nonce_that_was_known_before_the_submission(board):
 def test_a_nonce_of_a_missing_commit(board):
     board.publish("ab" * 20, "commit")
     commit(board)
-    assert "is no commit in the history" in wrong(board)["nonces"][0]
+    assert "is not a commit in the history" in wrong(board)["nonces"][0]
 
 
 @needs_git
@@ -374,7 +374,7 @@ def test_a_nonce_of_another_branch(board):
     git(folder, "checkout", "--quiet", "-")
     board.publish(value, "commit")
     commit(board)
-    assert "is no commit in the history" in wrong(board)["nonces"][0]
+    assert "is not a commit in the history" in wrong(board)["nonces"][0]
 
 
 def test_a_nonce_without_a_public_source(board):
@@ -476,7 +476,7 @@ def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
 def test_a_bad_pin_is_refused(board, tmp_path, monkeypatch, content):
     monkeypatch.setattr(audit, "PIN", tmp_path / "pin.json")
     audit.PIN.write_text(content)
-    assert "is no pin" in refused(board)
+    assert "is not a pin" in refused(board)
 
 
 # --- the commands -------------------------------------------------------------------------------------------

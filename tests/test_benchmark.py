@@ -125,7 +125,7 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--rounds", "0"], "a whole number of at least 1 is needed, got '0'"),
         (["bench", "--seconds", "nan"], "a number above 0 is needed, got 'nan'"),
         (["bench", "--output", "."], "argument --output: . is a folder"),
-        (["bench", "--output", "README.md/speed.json"], "README.md is no folder to write to"),
+        (["bench", "--output", "README.md/speed.json"], "README.md is not a writable folder"),
         (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--checkout", ".", incline.Tilt.id], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--threads", "0"], "a whole number of at least 1 is needed, got '0'"),

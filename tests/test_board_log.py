@@ -102,7 +102,7 @@ def test_a_damaged_line_is_named(board, line):
     board.log.write_bytes(board.log.read_bytes() + line.encode() + b"\n")
     add_another, withdraw = partial(add, board, "TQC"), partial(board.withdraw, next(iter(ids(board))), "x")
     for use in (board.read, add_another, withdraw, board.open, partial(board_data, board)):
-        with pytest.raises(BoardError, match=r"board.jsonl, line 3 is no event .* version control"):
+        with pytest.raises(BoardError, match=r"board.jsonl, line 3 is not an event .* version control"):
             use()
 
 
@@ -135,14 +135,14 @@ def rewritten(board, change):
         (lambda told: told.pop(2), "line 3: .* nonce 'n', which is not its own"),
         (lambda told: told.insert(1, told.pop(2)), "line 3: .* is earlier than the line before it"),
         (lambda told: told.append(told[3]), "line 5: .* is verified, but was verified already"),
-        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* is there already, verified"),
+        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* is already there, verified"),
         (lambda told: told.append(told[2] | {"at": told[3]["at"]}), "line 5: the nonce 'n' was published"),
         (lambda told: told[3].update(nonce="other"), "line 4: .* which is not its own"),
         (lambda told: told[3].update(supersedes=[told[1]["id"]]), "line 4: .* not another result"),
         (lambda told: told[3].update(supersedes=["Gone"]), "line 4: .* not another result"),
         (lambda told: told[0].update(number=2), "line 1: protocol 2 begins where 1 would be the next"),
         (lambda told: told[1].update(protocol=2), "line 2: .* added under protocol 2, the current is 1"),
-        (lambda told: told[3].update(event="rejected"), "line 4 is no event"),
+        (lambda told: told[3].update(event="rejected"), "line 4 is not an event"),
     ],
 )  # fmt: skip
 def test_events_that_contradict_each_other(board, change, reason):
@@ -175,7 +175,7 @@ def test_additions_of_two_clones_conflict(board, tmp_path):
     for how in ([], ["--union"]):  # a union would keep both, and break the chain
         merge = ["git", "merge-file", *how, "-p", str(a), str(base), str(b)]
         merged = subprocess.run(merge, capture_output=True).stdout
-        with pytest.raises(BoardError, match=r"line \d+ is (no event|not what followed)"):
+        with pytest.raises(BoardError, match=r"line \d+ is not (an event|what followed)"):
             parse(merged)
     shutil.copy(b, a)
     first = Board(first / "board")

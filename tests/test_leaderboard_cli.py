@@ -128,7 +128,7 @@ def test_ctrl_c_tells_how_to_go_on(run, monkeypatch, action, again):
     with monkeypatch.context() as patched:
         patched.setattr("lag_envs.leaderboard.cli.finish", interrupted)
         status, _, err = run(*action, "--board", "my board")
-    assert status == 130 and err.endswith(f"interrupted; what is done is kept, {again} goes on\n")
+    assert status == 130 and err.endswith(f"interrupted; what is done is kept, {again} resumes\n")
     assert run("add", "--board", "my board")[1].endswith(": verified\n")
 
 
@@ -167,7 +167,7 @@ def test_mistakes(run):
     Path("torn").mkdir()
     Path("torn", "board.jsonl").write_text('{"event": "prot')
     status, _, err = run("list", "--board", "torn")
-    assert status == 2 and "board.jsonl has no line but a torn one; restore it from version control" in err
+    assert status == 2 and "board.jsonl has only a torn line; restore it from version control" in err
     write("a")
     run("add", "a", "--nonce", "n")
     other = incline.Tilt.id
@@ -176,7 +176,7 @@ def test_mistakes(run):
     assert "published before" in run("add", write("b", "b"), "--nonce", "n")[2]
     assert "there is no protocol 3; the current one is 1" in run("show", ids()[0], "--protocol", "3")[2]
     Path("leaderboard/board.jsonl").write_text("<<<<<<< HEAD\n")
-    assert "line 1 is no event" in run("list")[2]
+    assert "line 1 is not an event" in run("list")[2]
 
 
 def test_missing_packages_are_named(run, monkeypatch):

@@ -361,7 +361,7 @@ def _mistaken(**changes):
         ),
         (
             {"reward": lambda self, *_: np.random.default_rng().random()},
-            "something else when it is run again",
+            "another result when it is run again",
         ),
         ({"terminated": lambda self, after, target, xp: after.x}, "returns a number; it must return a truth"),
         ({"terminated": lambda self, after, target, xp: None}, "returns None; it must return a truth value"),

@@ -139,7 +139,7 @@ def test_a_disk_without_room_is_named_before_the_work(tmp_path):
             f"dqn does not learn actions of {ENV}'s kind; there are ppo, sac",
         ),
         (["--learners", "fast_ppp"], "did you mean fast_ppo"),
-        (["--output", os.devnull], "is no regular file"),
+        (["--output", os.devnull], "is not a regular file"),
         (["--output", "a/race.png", "--picture", "a/../a/race.png"], "--output and --picture are both"),
     ],
 )

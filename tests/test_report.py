@@ -177,7 +177,7 @@ def test_command_line_errors(tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("mine")
     for arguments, message in (
         (["report", str(tmp_path)], "holds other things"),
-        (["report", str(tmp_path / "thesis.txt")], "thesis.txt is no folder"),
+        (["report", str(tmp_path / "thesis.txt")], "thesis.txt is not a folder"),
         (["report", "--sections", "stabilty", str(tmp_path / "new")], "did you mean stability?"),
         (
             ["report", "--docs", "nowhere", str(tmp_path / "new")],

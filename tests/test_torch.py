@@ -193,9 +193,9 @@ def test_errors(step):
         TorchVectorEnv(IDS[0], 2, action_delay=0.02)
     with pytest.raises(ValueError, match="give one value for all"):
         TorchVectorEnv(IDS[0], 2, damping=[0.0, 0.1])
-    with pytest.raises(ValueError, match="no environment of this package"):
+    with pytest.raises(ValueError, match="not an environment of this package"):
         TorchVectorEnv("Pendulum-v1", 2)
-    with pytest.raises(ValueError, match="Pendulum-v1 has no derivatives: it is no environment"):
+    with pytest.raises(ValueError, match="Pendulum-v1 has no derivatives: it is not an environment"):
         Step("Pendulum-v1")
     with pytest.raises(ValueError, match="options go with an id"):
         Step(step.task, damping=0.1)

@@ -130,7 +130,7 @@ def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
 
 
 def _accuracy(task: Task) -> list[str]:
-    """Describe the proved accuracy of steps from the edges of the starts under the largest controls."""
+    """Describe the proved accuracy of steps from extreme starts under the largest controls."""
     scene: Any = task.scene
     found, refused = [], 0
     for state, held in _edges(task):
@@ -147,7 +147,7 @@ def _accuracy(task: Task) -> list[str]:
         whole = sum(bound.substeps == 1 for bound in found)
         lines += [
             f"Taylor series of order {found[0].order}, {found[0].kind}",
-            f"from the edges of the starts under the largest controls: {whole} of {len(found)} steps "
+            f"from extreme starts under the largest controls: {whole} of {len(found)} steps "
             "certified as a "
             f"whole, {attempts} attempt{'s' if attempts > 1 else ''} at most",
             f"proved truncation error there: {largest:.1e} at most, in units of the state"
@@ -159,7 +159,7 @@ def _accuracy(task: Task) -> list[str]:
         shown, rate = math.floor(10.0 * speed) / 10.0, f"{layout_of(scene).free[0]}_dot"
         lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
     elif speed is not None:
-        lines += ["no speed is certified for one substep: the bound before each step decides their number"]
+        lines += ["one substep is certified at no speed: the bound before each step decides their number"]
     if refused:
         lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
     return lines

@@ -35,7 +35,7 @@ def new_file(text: str) -> Path:
     Raises
     ------
     argparse.ArgumentTypeError
-        If no such file can be written. Missing folders are made when it is.
+        If no such file can be written. Missing folders are made when the file is written.
     """
     path = Path(text)
     if path.is_dir():
@@ -46,7 +46,7 @@ def new_file(text: str) -> Path:
         return path
     folder = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
     if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise argparse.ArgumentTypeError(f"{text} cannot be written: {folder} is no folder to write to")
+        raise argparse.ArgumentTypeError(f"{text} cannot be written: {folder} is not a writable folder")
     with contextlib.suppress(OSError):  # no such file yet, or no output
         if os.path.samestat(path.stat(), os.fstat(1)):
             raise argparse.ArgumentTypeError(f"{text} is the file that this command prints to; name another")

@@ -127,7 +127,7 @@ def scenes(path: str) -> dict[str, type[Any]]:
 
 
 def _classes(module: ModuleType) -> dict[str, type]:
-    """Return the classes of a module by their first names: an alias is no other class."""
+    """Return the classes of a module by their first names: an alias does not count as another class."""
     names: dict[type, str] = {}
     for name, value in vars(module).items():
         if isinstance(value, type) and value.__module__ == module.__name__:

@@ -67,7 +67,7 @@ def pressed_action(
 
 
 class Gamepad:
-    """The first gamepad, if there is one; it may be plugged in or out at any time."""
+    """The first gamepad, if there is one; it may be plugged in or unplugged at any time."""
 
     def __init__(self) -> None:
         import pygame

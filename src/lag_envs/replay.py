@@ -1,6 +1,6 @@
 """Drives as links with seed and keys, and the command ``lag-envs replay``, which recomputes them.
 
-A link ends with ``#drive=`` and seven fields between ``~``::
+A link ends with ``#drive=`` and seven fields separated by ``~``::
 
     1 ~ id ~ seed ~ keys ~ return ~ step ~ check
 

@@ -18,7 +18,7 @@ def start(path: Path) -> Path:
     Raises
     ------
     UserError
-        If the file exists already or cannot be written, or its name cannot be imported by Python.
+        If the file already exists or cannot be written, or Python cannot import a module of its name.
     """
     if path.suffix != ".py":
         raise UserError(f"{path}: the file's name must end with .py, as in {path.stem or 'my_scene'}.py")

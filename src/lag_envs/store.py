@@ -38,7 +38,7 @@ def write_file(path: Path, data: bytes | str, sync: bool = False) -> None:
 
 @contextmanager
 def named(path: Path, part: Path | None = None) -> Iterator[None]:
-    """Name a file in errors that name none, as on a full disk, or only `part`, its unfinished copy."""
+    """Name the file in errors that name none, as on a full disk, or only `part`, its unfinished copy."""
     try:
         yield
     except OSError as error:

@@ -93,7 +93,7 @@ class Step:
             raise ValueError(f"options go with an id; the given task has its own, got {sorted(options)}")
         made: Any = gym.make(task, **options).unwrapped if isinstance(task, str) else None
         if made is not None and not isinstance(made, LagrangianEnv):
-            raise ValueError(f"{task} has no derivatives: it is no environment of this package")
+            raise ValueError(f"{task} has no derivatives: it is not an environment of this package")
         self.task = _checked_task(task if made is None else made.task)
         self.model = Model(self.task)
         formulas = self.task.formulas
@@ -204,7 +204,7 @@ class TorchVectorEnv:
             else LagrangianVectorEnv(task, num_envs, **options)
         )
         if not isinstance(made, LagrangianVectorEnv):
-            raise ValueError(f"{task} has no derivatives: it is no environment of this package")
+            raise ValueError(f"{task} has no derivatives: it is not an environment of this package")
         if any(other is not made.task for other in made.tasks):
             raise ValueError("gradients need the same parameters in all environments; give one value for all")
         _checked_task(made.task)

@@ -196,7 +196,7 @@ def run_stoppable(command: Sequence[str], environment: Mapping[str, str]) -> int
             asked = now
             with suppress(OSError, ValueError):  # it has just ended, or nobody reads this
                 os.write(pipe.fileno(), b".")
-                told = "\nstopping after what is being measured; again: at once, without results"
+                told = "\nstopping after this measurement; interrupt again to stop at once, without results"
                 print(told, file=sys.stderr, flush=True)
         elif now - asked > AT_ONCE:
             killed = now
@@ -232,7 +232,7 @@ def obey_parent() -> None:
 def stopping_point() -> None:
     """Raise KeyboardInterrupt if the parent asked this process to stop.
 
-    A signal could interrupt any code, of which some, such as JAX's, goes on as if nothing had happened.
+    A signal could interrupt any code, and some, such as JAX's, then continues as if nothing had happened.
     """
     if _asked.is_set():
         raise KeyboardInterrupt

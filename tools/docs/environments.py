@@ -269,7 +269,7 @@ def arguments(task: Task) -> str:
         default = default_text(getattr(task.scene, field.name))
         rows.append([f"`{field.name}`", default, unit, within, words.get(field.name, "")])
     rows += [
-        ["`dt`", number_text(task.dt), "s", "1e-6 to 1", "Control interval. The episode keeps its seconds."],
+        ["`dt`", number_text(task.dt), "s", "1e-6 to 1", "Control interval. The duration stays the same."],
         [
             "`duration`",
             number_text(task.duration),

@@ -92,7 +92,7 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
 REPORT = Command(
     "report",
     "measure errors, and write a page about them",
-    """Measure the error of every environment and scene against high precision, beside usual integrators
+    """Measure the error of every environment and scene against high precision, beside common integrators
 and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
 Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
 Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part if they are installed.

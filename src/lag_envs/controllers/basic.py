@@ -275,7 +275,7 @@ def check_single_control(what: str, task: Task) -> None:
 
 
 def beginning(n: int, state: Any, episode_start: ArrayLike | None) -> NDArray[np.bool_]:
-    """Return which of n episodes begin: without a memory all, else those that `predict` is told."""
+    """Return which of n episodes begin: all without a memory, else those named in the call of `predict`."""
     fresh = np.full(n, state is None)
     return fresh if episode_start is None else fresh | np.asarray(episode_start, np.bool_).reshape(n)
 
@@ -366,7 +366,7 @@ class ObservationDecoder:
         }
 
     def expected(self, states: Array) -> tuple[Array, Array]:
-        """Return observations of states (n, n_state) without targets, and their derivatives by the states."""
+        """Return observations of states (n, n_state) without targets, and the Jacobian matrices."""
         turned = states[:, self._angles]
         circles = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
         lifted = np.concatenate([states, circles.reshape(len(states), -1)], axis=1)

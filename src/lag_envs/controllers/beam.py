@@ -41,7 +41,7 @@ class Trajectory(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """The plan that each episode follows; `left` is what its steps from here on pay."""
+    """The plan that each episode follows; `left` is the return of its steps from here on."""
 
     step: NDArray[np.intp]  # (n,)
     length: NDArray[np.intp]  # (n,)
@@ -60,8 +60,8 @@ class BeamSearch:
     so far minus their final cost. The edges of a cell are a share of the states' standard deviations, so they
     have no units and grow with the level's spread.
 
-    A search ends once a sequence that terminates pays at least what any other can: these are credited with
-    the largest reward seen for each step that is left, or with nothing if all rewards are negative.
+    A search ends once a sequence that terminates pays at least what any other can. The others are credited
+    with the largest reward seen for each step that is left, or with nothing if all rewards are negative.
 
     The model agrees with an environment to rounding only. If an observed state differs from the plan, the
     rest of the plan is tried from there. If it pays less than before, there is a new search. The chance of

@@ -25,7 +25,7 @@ def easier(
 
     Instead of the guard, which has kinks, it has a penalty that begins before the track's end. It rewards the
     squared height, whose slope leads upward from anywhere and hardly matters beside the final cost. The
-    support is weaker, so that feedback has reserve to correct the plan with.
+    support is weaker, so that the feedback has a reserve with which to correct the plan.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: 
 
 
 def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **numbers: Any) -> MPC:
-    """Return a regulator that leaves states from which it would lose the bars to an MPC.
+    """Return a regulator that hands over to an MPC in states from which it would lose the bars.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class Pumped(Regulator):
         return actions_for(self.task, np.where(holds, self.control(x, target), self.swing(x))), holds
 
     def law(self, task: Task) -> None:
-        """Tell that this is not pure feedback."""
+        """Return None: this is not pure feedback."""
         return
 
 

@@ -133,7 +133,7 @@ class ILQR:
     def plan(self, starts: Array, targets: Array) -> tuple[Plan, Array]:
         """Return the best plan for each start (n, n_state) and target, and its return from `improve`.
 
-        Targets have the shape (n,), whether there are any or not, or (n, n_targets) if there are several.
+        Targets have the shape (n,), even if the task has none, or (n, n_targets) if there are several.
         """
         best: Plan | None = None
         most = np.full(len(starts), -math.inf)
@@ -161,14 +161,14 @@ class ILQR:
         return actions.ravel() if self.count == 1 else actions.reshape(-1, self.count)
 
     def _goals(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
-        """Return the targets of as many steps, as `Model` takes them; None if the task has none."""
+        """Return targets for steps of this shape, as `Model` takes them; None if the task has none."""
         if self.task.target_range is None:
             return None
         each = np.shape(self.task.target_range)
         return np.broadcast_to(targets, (*shape, *each)).reshape(-1, *each)
 
     def _acting(self, guess: Any) -> Feedback:
-        """Return the feedback that a controller is in one roll-out."""
+        """Return a controller as feedback for one roll-out."""
         memory, form, formulas = None, form_of(self.task.scene), self.task.formulas
 
         def act(x: Array, targets: Array, step: int) -> Array:
@@ -375,7 +375,7 @@ def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: flo
     bend : ndarray, shape (n, m, m)
         The value's negative curvature, positive definite.
     mixed : ndarray, shape (n, m, n_state)
-        Its second derivatives by action and state.
+        Its second derivatives with respect to action and state.
     largest : float
         The largest action.
 

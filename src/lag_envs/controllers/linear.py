@@ -184,7 +184,7 @@ class Regulator(FeedbackController):
         self.gain = np.linalg.solve(r + b.T @ self.cost @ b, b.T @ self.cost @ a)
 
     def _check_rest(self, task: Task) -> None:
-        """Raise a ValueError where the state does not stay without control."""
+        """Raise a ValueError if the state does not stay at rest without control."""
         scene = task.scene
         (after,) = scene.simulate(self.rest, np.zeros((1, len(scene.control_names))), task.dt)[1:]
         moved = np.abs(self.read.difference(after, self.rest))
@@ -216,7 +216,7 @@ class Regulator(FeedbackController):
 class BalanceLQR(FeedbackController):
     """Keep bodies on a moving support upright by a linear-quadratic regulator, despite kicks.
 
-    The reward alone would make the control as hard as possible; the added weights keep the regulator ready
+    The reward alone would make the regulator react as hard as possible; the added weights keep it ready
     for the next kick. ``python -m agents.tune`` found them.
 
     Parameters

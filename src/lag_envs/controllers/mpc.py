@@ -297,7 +297,7 @@ def planner(
     Raises
     ------
     ValueError
-        For names that are no entries of the state, and a task with listed actions.
+        For names that are not entries of the state, and a task with listed actions.
     """
     for what, given in (("weights", weights), ("rest", rest)):
         check_names(what, given or {}, task.scene.state_names)
@@ -305,7 +305,7 @@ def planner(
 
 
 def loss(task: Task) -> Callable[[Array], Array]:
-    """Return the best regulator's loss of reward from given states, near upright; farther off, more."""
+    """Return the best regulator's loss of reward from states near upright; farther off, a larger one."""
     read, rest = ObservationDecoder(task), np.array(task.plans.rest)
     # Rewards ignore where on the track a support stands; something has to draw it back.
     extra = {"s": 0.02 / task.length**2} if isinstance(task, GuardedTrack) else {}
@@ -314,7 +314,7 @@ def loss(task: Task) -> Callable[[Array], Array]:
     def lost(states: Array) -> Array:
         off = read.difference(states, rest)
         loss = np.einsum("...i,ij,...j->...", off, cost, off)
-        return loss + loss**2  # the control is limited: where much is to be lost, all is
+        return loss + loss**2  # as the control is limited, a large loss means losing all
 
     return lost
 

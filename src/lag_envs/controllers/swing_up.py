@@ -22,8 +22,8 @@ def easier(
 ) -> tuple[Task, Callable[[Array], Array]]:
     """Return a task that is easier to plan for, and the final cost of a plan.
 
-    Almost only a plan's end counts, and its course only a little. The control is weaker, so that feedback has
-    reserve to correct the plan with.
+    A plan's end counts most, its course only a little. The control is weaker, so that the feedback has a
+    reserve with which to correct the plan.
 
     Parameters
     ----------

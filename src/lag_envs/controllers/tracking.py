@@ -151,7 +151,7 @@ def hold(task: Task, plans: Plans | None = None) -> Tracking:
 
 
 def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
-    """Return the controller that follows states (steps + 1, n_state) and actions, shaped as `Tracking`'s."""
+    """Return the controller that follows states and actions, with the shapes that `Tracking` takes."""
     states, actions = np.asarray(states, np.float64), np.asarray(actions, np.float64)
     gains, last = time_varying(smoothed(task), states, actions, plans.rest, plans.weights, plans.effort)
     return Tracking(task, states=states, actions=actions, gains=gains, rest=plans.rest, hold=last)

@@ -113,7 +113,7 @@ def _step_all(  # type: ignore[no-untyped-def]
 
 
 def _bad_action(f, action, count, size, first):  # type: ignore[no-untyped-def]
-    """Return -(i + 1) if action i is not finite, or 0; of a row in `f`, see `write_places`.
+    """Return -(i + 1) if action i is not finite, or 0; for `size` and `first`, see `write_places`.
 
     An environment that is to be restarted ignores its action.
     """

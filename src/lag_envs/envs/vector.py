@@ -438,7 +438,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def order(self) -> int | None:
-        """Order of the general series; None where the scene has a flow of its own, so that none can be set.
+        """Order of the general series; None if the scene has a flow of its own: then it cannot be set.
 
         The order changes only the speed: each step is certified to the same tolerance with any order.
         """

@@ -45,7 +45,7 @@ class Condition:
         return int(TASKS[env_id](**self.options).limit)
 
     def suits(self, agent: Any, plans: bool) -> bool:
-        """Return whether an agent can act under this: planning or a memory is tied to one control interval.
+        """Return whether an agent can act under it; planning and some memories need one control interval.
 
         Parameters
         ----------

@@ -167,7 +167,7 @@ class Likeness:
         return self._tracks[submission.digest]
 
     def __call__(self, newer: Submission, older: Submission, error: float) -> Distance:
-        """Return the distance of a submission from an older one: half of its policies are at most so far.
+        """Return the distance of a submission from an older one: half of its policies are no farther away.
 
         Parameters
         ----------

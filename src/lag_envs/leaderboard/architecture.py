@@ -1,4 +1,4 @@
-"""The base of all architectures: one reads a table, names the arrays it needs, and makes an agent of them."""
+"""The base of all architectures: each reads a table, names the arrays it needs, and makes an agent."""
 
 from __future__ import annotations
 

@@ -181,7 +181,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
         return found
     except (OSError, ValueError) as error:
         told = error.strerror if isinstance(error, OSError) else error
-        found.wrong.append(f"{path} is no pin: {told}; {REMEDY}")
+        found.wrong.append(f"{path} is not a pin: {told}; {REMEDY}")
         return found
     lines = log.split(b"\n")
     if file is None and hashlib.sha256(lines[0] + b"\n").hexdigest() != pin.board:
@@ -415,7 +415,7 @@ def _nonces(board: Board, found: CheapChecks) -> Finding:
             then = log_at(board.folder, value)
         except NoHistory:
             finding.wrong.append(
-                f"{where} is no commit in the history of what is checked out; fetch the whole history, or"
+                f"{where} is not a commit in the history of the checkout; fetch the whole history, or"
                 " withdraw what was verified with it"
             )
             continue
@@ -426,10 +426,10 @@ def _nonces(board: Board, found: CheapChecks) -> Finding:
             if lines < line.number < number and isinstance(line.event, Added | Opened | Protocol)
         ]
         if lines >= number or not found.log.startswith(then):
-            finding.wrong.append(f"{where} is of a commit that held another log; {REMEDY}")
+            finding.wrong.append(f"{where} is the hash of a commit that held another log; {REMEDY}")
         elif decided:
             finding.wrong.append(
-                f"{where} is of a commit that was there before line {decided[0]}, which it decides: it"
+                f"{where} is the hash of a commit made before line {decided[0]}, which it decides: it"
                 " was known; withdraw what was added by then"
             )
         else:

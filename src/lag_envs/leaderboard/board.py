@@ -284,7 +284,7 @@ class Board:
         Returns
         -------
         list of Entry
-            Those it still has to be compared with; then nothing is kept.
+            Submissions that it still has to be compared with. If there are any, nothing is kept.
         """
         alike = alike or {}
         content = gzip.compress(json.dumps(result, separators=(",", ":")).encode(), mtime=0)

@@ -151,7 +151,7 @@ def run_leaderboard(args: argparse.Namespace) -> int:
         if args.action in ("add", "nonce"):
             board = "" if args.board == Path("leaderboard") else f" --board {shlex.quote(str(args.board))}"
             again = "the same command" if args.action == "add" else f"`lag-envs leaderboard add{board}`"
-            print(f"interrupted; what is done is kept, {again} goes on", file=sys.stderr)
+            print(f"interrupted; what is done is kept, {again} resumes", file=sys.stderr)
         raise
 
 
@@ -308,7 +308,7 @@ def _some(board: Board) -> BoardState:
         raise
     if not state.entries:
         if parse(read_log(board.log))[1]:
-            raise BoardError(f"{board.log} has no line but a torn one; {REMEDY}")
+            raise BoardError(f"{board.log} has only a torn line; {REMEDY}")
         raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
     return state
 

@@ -39,7 +39,7 @@ class GridTable(PolicyTable):
 
 
 class GridArchitecture(Architecture):
-    """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, those of the edge.
+    """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, those at the edge.
 
     In the table: `axes`, a list of the axes: a state by its name (`lag-envs info ID`), ``target``, a state
     relative to the target as ``"x - target"``, or ``time`` [s] since the episode's start. An angle that is

@@ -31,7 +31,7 @@ LOG = "board.jsonl"
 MOST = 2**26
 STATES = ("pending", "verified", "rejected", "superseded", "withdrawn")
 REMEDY = "restore it from version control"
-#: All of one length and in UTC, so that they sort as text, and none in a future that a clock cannot pass.
+#: All of one length and in UTC, so that they sort as text, and none so far ahead that no clock gets past it.
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
 
 
@@ -236,7 +236,7 @@ def parse(log: bytes) -> tuple[list[LogLine], bytes]:
                 if last:
                     return lines, tail
                 told = shown_ascii(line[:60].decode(errors="replace"))
-                raise _damaged(number, f"is no event ({error}): {told}") from None
+                raise _damaged(number, f"is not an event ({error}): {told}") from None
             if chained and event.prev is None:
                 raise _damaged(number, "holds no hash of the lines before it")
             if event.prev is not None and event.prev != before.hexdigest():
@@ -442,9 +442,9 @@ def _add(state: BoardState, event: Added, line: int) -> None:
         )
         return
     if known.state not in ("rejected", "withdrawn"):
-        raise ValueError(f"{event.id} is added, and is there already, {known.state}")
+        raise ValueError(f"{event.id} is added, but is already there, {known.state}")
     if any(getattr(known, key) != value for key, value in told.items()):
-        raise ValueError(f"{event.id} is added again as another than it was")
+        raise ValueError(f"{event.id} is added again with other data")
     # Coming back does not change the episodes, nor the result if there is one.
     back = replace(known, state="verified" if known.sha256 else "pending", reason="")
     newer = [

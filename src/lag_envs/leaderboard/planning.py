@@ -82,7 +82,7 @@ class PlanAhead(Architecture):
         if steps > protocol.MODEL_STEPS:
             raise Refused(
                 f"{POLICY}: renewing plans takes {steps:.0f} steps of the model per step of the environment, "
-                f"at most {protocol.MODEL_STEPS} are allowed; plan less far, or less often"
+                f"at most {protocol.MODEL_STEPS} are allowed; shorten the horizon, or plan less often"
             )
         if not listed:
             self.numbers = table.model_dump(exclude={"architecture", *LISTED}, exclude_none=True)

@@ -16,7 +16,7 @@ from lag_envs.tasks.measured import measured_entry
 SCHEMA = 2
 #: Episodes of each policy, without and with each disturbance.
 EPISODES, DISTURBED_EPISODES = 1000, 100
-#: Policies that a learner must submit, one per training seed; and that anyone may submit.
+#: Policies: the fewest that a learner must submit, one per training seed; the most that anyone may submit.
 LEARNED_POLICIES, MOST_POLICIES = 5, 20
 #: How far returns may differ between two builds, relative to the distance from random to best known.
 #: Libraries round the last digit of tanh differently, and the difference may grow in the course of an

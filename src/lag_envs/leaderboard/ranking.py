@@ -279,7 +279,7 @@ def pooled(policies: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
 def _scores(
     scale: Scale, returns: Mapping[str, Sequence[float | None] | None], moved: Array
 ) -> dict[str, float]:
-    """Return the score of policies' mean returns by condition, shifted; without those that one was not in."""
+    """Return the score under each condition, shifted; conditions that a policy did not play are left out."""
     full = {name: each for name, each in returns.items() if each and None not in each}
     if not full:
         return {}

@@ -161,7 +161,7 @@ def record_again(
         The submission.
     result : dict
         What `verify` returned, or its digest, nonce and number of episodes.
-    The result of `verify`, or its digest, nonce and number of episodes.
+    policy : int
         Number of the policy, from 0.
     chosen : sequence of int
         Numbers of the episodes, from 0.
@@ -230,7 +230,7 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folders", metavar="FOLDER", nargs="+", help="a submission")
     parser.add_argument(
         "--nonce", default="", metavar="TEXT",
-        help="from it the episodes' seeds follow (default: empty, for the same practice episodes each time)",
+        help="determines the episodes' seeds (default: empty, for the same practice episodes each time)",
     )  # fmt: skip
     parser.add_argument(
         "--episodes", metavar="N", type=int, default=protocol.EPISODES,

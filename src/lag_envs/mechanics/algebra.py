@@ -3,10 +3,10 @@
 Energies are run once on `Expr` objects. An `Expr` is kept expanded, as a map from monomials to rational
 coefficients, so that equal terms are merged and terms that cancel leave nothing behind: deriving an equation
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
-an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers of moving
-sums are not expanded, except squares whose terms may meet others. Besides the rules of sums and products
-there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that agree in everything else
-(`apply_identities`).
+an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers of sums
+that change with the motion are not expanded, except squares whose terms may combine with others. Besides the
+rules of sums and products there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that
+agree in everything else (`apply_identities`).
 
 Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
 same bits in every process.

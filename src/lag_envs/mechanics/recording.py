@@ -205,7 +205,7 @@ def check_signature(scene: Any, name: str) -> None:
     plain = [p for p in taken if p.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)]
     if len(plain) != len(arguments) or len(plain) != len(taken):
         time = (
-            "; time is no argument, a prescribed coordinate moves"
+            "; time is not an argument: for a given motion use a prescribed coordinate"
             if {"t", "time"} & {p.name for p in taken}
             else ""
         )
@@ -275,7 +275,7 @@ def check_again(scene: Any, layout: SceneLayout, found: Record) -> None:
     again = record_scene(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
         raise FormulaError(
-            f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend on "
+            f"{type(scene).__name__}: a formula gives another result when it is run again; it may depend on "
             "place, velocity, controls and fields only, not on time or chance"
         )
 

@@ -70,7 +70,7 @@ def make_report(settings: ReportSettings) -> bool:
 def prepare(folder: Path) -> Path:
     """Return the folder, which is new, empty or already a report's."""
     if folder.exists() and not folder.is_dir():
-        raise NotAReport(f"{folder} is no folder; name a new or an empty one")
+        raise NotAReport(f"{folder} is not a folder; name a new or an empty one")
     folder.mkdir(parents=True, exist_ok=True)
     names = {path.name for path in folder.iterdir()}
     if names and "results.jsonl" not in names:

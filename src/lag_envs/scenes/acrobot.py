@@ -4,7 +4,7 @@ r"""Two links hanging from a pivot, with a torque at the elbow, at the shoulder,
 
         A          theta_1   angle of the first link, 0 hangs straight down
          \
-          \        theta_2   angle of the second against the first, 0 is straight
+          \        theta_2   angle of the second link from the first, 0 is straight
            B---
                C   both positive counter-clockwise
 

@@ -611,7 +611,7 @@ class Scene(metaclass=SceneType):
             for recordings of a wrong shape, with too few values, or with controls that are not finite.
         StepRefused
             If the motion cannot be simulated with the initial parameters. A coordinate that was not measured
-            is first guessed to be 0, and is named if it is.
+            is first guessed to be 0; the error then names it.
         """
         from lag_envs.scenes.fitting.fit import fit
 

@@ -5,7 +5,7 @@ r"""A chain of equal bars hanging from a moving support.
               s ->
         ------A------   support, moved with acceleration s''
                \
-                \  l    theta_1, theta_2, ...   angles of the bars against straight down,
+                \  l    theta_1, theta_2, ...   angles of the bars from straight down,
                  o                              positive counter-clockwise
                  |
                  |      the support is at (s, rise); `rise` rests at 0 and is there for the vertical force

@@ -280,7 +280,7 @@ def evaluate_expression(expression: Any, values: Mapping[Any, Any], xp: Any) -> 
     if expression.func in _FUNCTIONS:
         return getattr(xp, _FUNCTIONS[expression.func])(of(expression.args[0]))
     if expression.is_Symbol or isinstance(expression, AppliedUndef | sympy.Derivative):
-        time = " (time is no symbol of an energy)" if str(expression) == "t" else ""
+        time = " (an energy has no symbol for time)" if str(expression) == "t" else ""
         raise FormulaError(
             f"{expression} is neither a coordinate, its velocity, a control nor a parameter of this "
             f"formula{time}; declare it"

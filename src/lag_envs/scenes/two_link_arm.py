@@ -4,8 +4,8 @@ r"""A robot's arm of two links in a vertical plane, with a motor in each joint a
 
                C   hand, with the load
               /
-        A----B     theta_1   angle of the upper arm against the horizontal,
-                   theta_2   angle of the forearm against the upper arm,
+        A----B     theta_1   angle of the upper arm from the horizontal,
+                   theta_2   angle of the forearm from the upper arm,
                              both positive counter-clockwise
 
 With l the lengths of the uniform links, m their masses and p the load's mass, G the links' centres at half

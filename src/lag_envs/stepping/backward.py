@@ -1,10 +1,10 @@
-"""The step of `lag_envs.stepping.series` backwards: from gradients by its end to gradients by its start.
+"""The step of `lag_envs.stepping.series` backwards: from the gradient at its end to that at its start.
 
 The series that ends a control step is still available; those of earlier substeps are expanded again. Then the
 recurrences are traversed from the highest order to the lowest. Each is a relation that is linear in the
 coefficient that it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The
-cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
-Σ_{k>j} P_k B_{k-j} that of A_j. So an order costs two of them where the series has one. The lengths of the
+cotangent P_k of its Σ_j A_j B_{k-j} is kept. The cotangents of its factors are then sums of products too:
+that of A_j is Σ_{k>j} P_k B_{k-j}. So an order costs two sums where the series has one. The lengths of the
 substeps are held fixed.
 """
 
@@ -27,7 +27,7 @@ class Backward(Series):
     record : SeriesRecord
         What is stepped, made with tangents.
     sources : tuple of str
-        What gradients are wanted by besides places and velocities: names in the record's tangents.
+        Names in the record's tangents: gradients are with respect to them, places and velocities.
     """
 
     def __init__(self, record: SeriesRecord, sources: tuple[str, ...]) -> None:
@@ -196,7 +196,7 @@ class Backward(Series):
     def _gather(self, t: Target, k: Any, order: Any, first: bool = False) -> dict[Factor, Any]:
         """Return what sums of products of higher orders add to cotangents of factors of order k.
 
-        To those that are kept in slots it is added there.
+        For factors whose cotangents are kept in slots, it is added there.
         """
         found: dict[Factor, Any] = {}
         pairs = list(self.pairs.items())

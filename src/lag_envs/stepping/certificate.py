@@ -37,8 +37,8 @@ class Certificate:
       said of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where
       w is z, A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
 
-    Each holds for partial sums too, as the proof requires: the coefficient k of the left-hand side takes from
-    its own series what is below k only.
+    Each holds for partial sums too, as the proof requires: coefficient k of the left-hand side uses only
+    coefficients below k of its own series.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class Certificate:
         return self._powered(self._overlaps[self._series.pairs[key]])
 
     def _powered(self, x: Any) -> Any:
-        """Return what terms of order N and above, of this size together, are in the part of the step."""
+        """Return the size of terms of order N and above in the part of the step, from that in the whole."""
         return x if self._power is None else self._t.mul(self._power, x)
 
     def _norm(self, n: int) -> Any:

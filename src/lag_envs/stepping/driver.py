@@ -227,8 +227,8 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
     has other variables, which depend linearly on these: inputs, places and velocities are
     ``constants + starts @ given``. `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the
-    cotangents of places, velocities and sources. `by_end` holds the derivatives of places and velocities by
-    the state, followed by `direct`.
+    cotangents of places, velocities and sources. `by_end` holds the derivatives of places and velocities with
+    respect to the state, followed by `direct`.
 
     Unfinished lanes are moved together, as in `_rest`. The substep that ends a step usually goes backwards at
     once, using the series just expanded. All other substeps are stored, round by round, and go backwards

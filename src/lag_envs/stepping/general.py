@@ -179,7 +179,7 @@ class SeriesStepper:
         return after, u
 
     def _by(self, p: Prescribed, numbers: Sequence) -> Any:
-        """Return, from numbers for each control, the number of the control of a prescribed coordinate."""
+        """Return the number for the control of a prescribed coordinate, from the numbers for all controls."""
         return numbers[self._layout.controls.index(p.control or "")]
 
     # --- derivatives ---------------------------------------------------------------------------------------

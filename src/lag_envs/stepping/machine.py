@@ -207,7 +207,7 @@ class Machine:
         at = [b.gep(places, [ir.Constant(_INT, i)]) for i in range(len(values))]
         for place, value in zip(at, values, strict=True):
             b.store(value, place)
-        # For all that LLVM knows, this changes what lies there; it is no instruction.
+        # As far as LLVM knows, this changes what lies there; it generates no instruction.
         kind = ir.FunctionType(void, [places.type])
         b.call(ir.InlineAsm(kind, "", "r,~{memory}", side_effect=True), [places])
         return lambda: [b.load(place) for place in at]
@@ -421,7 +421,7 @@ def compile_series_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Ca
     record : SeriesRecord
         What is stepped, made with tangents.
     columns : tuple of str
-        By what derivatives are taken: places and velocities, and what the record's tangents name.
+        What derivatives are taken with respect to: places, velocities, and names in the record's tangents.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
     kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])

@@ -13,16 +13,16 @@ order (sums termwise, products by convolution, functions by z' = w x'), with q_{
 with M_0⁻¹ found once, as numbers. docs/engine.md derives all of this.
 
 **Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
-above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
-up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after
-N - 1, the step is accepted if for some E_a > 0::
+above. The coefficients below N of every node, and v_N, are known. Suppose that those of the velocities beyond
+N sum up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut
+after N - 1, the step is accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
 
 Proof: v_{k+1} = h a_k/(k+1), and a_k depends on coefficients up to order k only. So if the partial sums of
 the tails up to k obey E_v and E_a, those up to k + 1 do; they stay bounded, so the series converges on the
 whole step and is the solution. That the inequality is strict makes M invertible throughout. What is proved is
-the truncation of each substep: rounding comes on top, and what the flow makes of earlier errors.
+the truncation of each substep: rounding and the growth of earlier errors come on top.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Series:
     def __init__(self, record: SeriesRecord) -> None:
         self.record, self.size = record, record.size
         self.slot_of: dict[tuple[str, int], int] = {}
-        #: Nodes of which more than the value is needed.
+        #: Nodes that need more than their value.
         self.live = self._find_live()
         #: Products of series, by what needs them: a node or a place (i, j) in the mass matrix.
         self.pairs: dict[Any, tuple[Factor, Factor]] = {}
@@ -552,7 +552,7 @@ class Series:
     def substep(
         self, t: Target, inputs: dict[str, Any], lane: StepProgress, dt: Any, order: Any, tolerance: Any
     ) -> tuple[StepProgress, list]:
-        """Continue with a control step dt of which something is left, by what one expansion gives.
+        """Continue an unfinished control step dt by as much as one expansion gives.
 
         Returns
         -------
@@ -608,8 +608,8 @@ class Series:
 def _slope_of_tanh(t: Target, x: Any) -> Any:
     """Return 1 - tanh², with all digits also where tanh is nearly 1.
 
-    Taking 1 - tanh² literally would leave it a few digits or none, and so all coefficients of tanh. Where
-    tanh rounds to 1 they would be 0, and a step on which it falls to 0 would be certified with it at 1.
+    Computed literally, 1 - tanh² would have few digits or none, and so would all coefficients of tanh. Where
+    tanh rounds to 1 they would be 0, and a step on which it falls to 0 would be certified as if it stayed 1.
     """
     fading = t.elementary("exp", t.mul(t.number(-2.0), t.abs(x)))
     grown = t.add(t.number(1.0), fading)

@@ -17,7 +17,7 @@ from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 _ANGLES = {
     "cos(theta_1)": ("1", "cosine of the first link's angle, 1 hanging"),
     "sin(theta_1)": ("1", "its sine"),
-    "cos(theta_2)": ("1", "cosine of the second link's angle against the first, 1 straight"),
+    "cos(theta_2)": ("1", "cosine of the second link's angle from the first, 1 straight"),
     "sin(theta_2)": ("1", "its sine"),
 }
 #: For learners with a replay buffer on the real machines, where a step is short and pays at most 0.02: eight
@@ -96,7 +96,7 @@ class AcrobotExact(Task):
     quantities = {
         **_ANGLES,
         "theta_1_dot": ("rad/s", "angular velocity of the first link, clipped at 4π"),
-        "theta_2_dot": ("rad/s", "that of the second against the first, clipped at 9π"),
+        "theta_2_dot": ("rad/s", "that of the second link relative to it, clipped at 9π"),
     }
     scene: Any = Acrobot
     defaults = {"inertia_1": 1.0, "inertia_2": 1.0, "gravity": 9.8}
@@ -135,7 +135,7 @@ class AcrobotExact(Task):
     note = (
         "The switch takes the torque's sign from a weighted sum of observations, with weights found by "
         "random search. It never plans ahead. The beam search does, on the exact model: of the states that "
-        "it can reach, it follows those with the most energy, of each neighbourhood one. It reaches the line "
+        "it can reach, it follows those with the most energy, one in each neighbourhood. It reaches the line "
         "first. Nothing proves its plans the shortest, but much wider searches hardly shorten them. The PPO "
         "in one file comes close to it; it takes more steps than the other learners, and less time."
     )
@@ -251,7 +251,7 @@ class AcrobotReal(Task):
     quantities = {
         **_ANGLES,
         "theta_1_dot/10": ("rad/s", "angular velocity of the first link, divided by 10"),
-        "theta_2_dot/20": ("rad/s", "that of the second against the first, divided by 20"),
+        "theta_2_dot/20": ("rad/s", "that of the second link relative to it, divided by 20"),
     }
     scene: Any = Acrobot
     #: Inertias about the centres of mass; the source gives 0.031887199591513114 and 0.05086984812807257 kg m²

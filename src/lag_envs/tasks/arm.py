@@ -66,10 +66,10 @@ class Reach(Task):
     quantities = {
         "cos(theta_1)": ("1", "cosine of the upper arm's angle, 1 level to the right"),
         "sin(theta_1)": ("1", "its sine, -1 hanging"),
-        "cos(theta_2)": ("1", "cosine of the forearm's angle against the upper arm, 1 stretched"),
+        "cos(theta_2)": ("1", "cosine of the forearm's angle from the upper arm, 1 stretched"),
         "sin(theta_2)": ("1", "its sine"),
         "theta_1_dot/5": ("rad/s", "angular velocity of the upper arm, divided by 5"),
-        "theta_2_dot/10": ("rad/s", "that of the forearm against it, divided by 10"),
+        "theta_2_dot/10": ("rad/s", "angular velocity of the forearm relative to it, divided by 10"),
         "goal_x": ("m", "place of the point to reach, to the right of the shoulder"),
         "goal_y": ("m", "its height above the shoulder"),
     }

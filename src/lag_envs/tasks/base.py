@@ -93,9 +93,8 @@ class Task:
         that are on in this task's environments. On an instance: the checked values, or None. Formulas, and so
         `envs.model.Model` and controllers, are those of the task without them.
     hyperparameters : mapping
-        For a learner, one of `lag_envs.hyperparams.learners`, or for "off_policy", which stands for several:
-        the differences from `lag_envs.hyperparams.DEFAULTS`. Settings in its `policy_kwargs` are changed one
-        by one.
+        Differences from `lag_envs.hyperparams.DEFAULTS`, by learner: one of `lag_envs.hyperparams.learners`,
+        or "off_policy", which stands for several. Settings in `policy_kwargs` are changed one by one.
     goal : record.Goal, optional
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
@@ -242,11 +241,11 @@ class Task:
         return {}
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return the reward of a step of `interval`."""
+        """Return the reward of a step of length `interval`."""
         raise FormulaError("it is not defined; write reward(self, before, after, control, target, dt, xp)")
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return the reward of the terminating step; by default the same as of any other."""
+        """Return the reward of the terminating step; by default, that of any other step."""
         return self.reward(before, after, control, target, dt, xp)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
@@ -279,7 +278,7 @@ class Task:
             ended = bool(self.terminated(self.formulas.named_state([*numbers]), None, np))
         if ended:
             given = ", ".join(f"{n}={x:g}" for n, x in zip(self.scene.state_names, numbers, strict=True))
-            raise ValueError(f"the episode would be over at {given}; give a state where it goes on")
+            raise ValueError(f"the episode would be over at {given}; give a state at which it continues")
 
     @property
     def fastest(self) -> float:
@@ -321,9 +320,9 @@ class Task:
         Parameters
         ----------
         state, control : Values or sequence of numbers
-            As formulas have them, or numbers.
+            As in formulas, or numbers.
         xp : namespace
-            That of the formula; NumPy for numbers.
+            The formula's; NumPy for numbers.
 
         Returns
         -------
@@ -400,7 +399,7 @@ class Task:
 
     @cached_property
     def drawn(self) -> Drawn | None:
-        """The tasks among which each episode's is drawn; None if no parameter is drawn."""
+        """The tasks from which each episode's task is drawn; None if no parameter is drawn."""
         return Drawn(self) if self.imperfections and self.imperfections.drawn else None
 
     def varied(self, **parameters: float) -> Task:

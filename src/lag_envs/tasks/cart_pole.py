@@ -61,7 +61,7 @@ class CartPoleExact(_OnTrack):
     vice versa.
 
     One thing differs. Gymnasium steps by explicit Euler, so the position after a step does not depend on that
-    step's push, and energy grows out of nothing, within ten seconds to several times its initial value. Here
+    step's push, and energy grows without a cause, to several times its initial value within ten seconds. Here
     the motion under the held force is exact. At the end of an episode, values beyond the observation space
     are clipped in the observation, not in the state.
 
@@ -218,7 +218,7 @@ class CartPoleContinuous(_OnTrack):
 
     ## Equations
 
-    Upright and without a force, the pole of the default parameters falls e-fold in 0.25 s.
+    Upright and without a force, a deviation of the default pole grows e-fold in 0.25 s.
 
     ## Signs and Units
 

@@ -632,7 +632,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
 """
 
     def check(self) -> None:
-        """Require a finite track: the episode ends at its ends."""
+        """Require a finite track, since the episode ends when the support leaves it."""
         if math.isinf(self.scene.track):
             raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
 

@@ -425,7 +425,7 @@ class Damping(Task):
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step. The action -1
-    is no brake.
+    releases the brake.
 
     ## Observation Space
 

@@ -163,7 +163,7 @@ class TaskFormulas:
             names, code = self._recorded()
             if self._recorded()[1] != code:
                 raise FormulaError(
-                    f"{type(task).__name__}: a formula gives something else when it is run again; it may "
+                    f"{type(task).__name__}: a formula gives another result when it is run again; it may "
                     "depend on its arguments and on parameters only, not on time or chance"
                 )
             known[key] = names, self._chances
@@ -324,7 +324,7 @@ class TaskFormulas:
         return self.reward(xp, y, z, u, g, k), ended
 
     def reward(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
-        """Return the reward of a step that goes on."""
+        """Return the reward of a step that does not end the episode."""
         return self._reward("reward", xp, y, z, u, g, k)
 
     def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:

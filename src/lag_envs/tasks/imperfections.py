@@ -388,7 +388,7 @@ assert tuple(_READERS) == KEYWORDS
 
 
 class Drawn:
-    """The tasks among which an episode's is drawn.
+    """The tasks from which an episode's task is drawn.
 
     Parameters
     ----------

@@ -209,7 +209,7 @@ class PendulumRegret(_Rod):
 
     ## Rewards
 
-    Let V be the potential energy that the rod lacks from upright, plus its kinetic energy, as a share of the
+    Let V be the potential energy that the rod lacks to be upright, plus its kinetic energy, as a share of the
     potential energy between hanging and upright, times 100. And let π be a control law: far from upright a
     torque that pumps the energy to that of the upright equilibrium, near it a damped spring. Each step pays
 

@@ -495,7 +495,7 @@ the bar in about the same number of episodes. SAC and TQC are a little worse, TD
 """
 
     def check(self) -> None:
-        """Require a finite track: the episode ends at its ends."""
+        """Require a finite track, since the episode ends when the support leaves it."""
         if self.scene.track is None or math.isinf(self.scene.track):
             raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
 

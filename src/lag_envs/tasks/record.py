@@ -29,11 +29,11 @@ class Goal:
         Name of the event of reaching the goal, in a word or two. docs/agents.md reports its time and the
         reward lost until then; with an empty string it does not.
     rules : int
-        Version of the board's rules: 2 adds to its disturbances imperfect sensors and actuators, and hidden
-        parameters. A board keeps the version that it began with.
+        Version of the board's rules: 2 adds imperfect sensors and actuators, and hidden parameters, to its
+        disturbances. A board keeps the version that it began with.
     counted : bool
-        Whether the board shows how many episodes succeed. Not if its protocol began with a rule that cannot
-        hold: it stays as it is until the next one.
+        Whether the board shows how many episodes succeed. False if its protocol began with a rule for success
+        that cannot hold: the rule stays until the next protocol.
     """
 
     text: str
@@ -163,8 +163,8 @@ class Axis:
     cells : int
         Cells at level 1, even; twice as many at level 2.
     scale : float, optional
-        Within this distance of the centre the nodes are evenly spaced, farther out ever wider. None: evenly
-        spaced everywhere.
+        Within this distance of the centre the nodes are evenly spaced; farther out the spacing grows. None:
+        evenly spaced everywhere.
     centre : float or "target"
         Where nodes are densest.
     periodic : bool
@@ -211,8 +211,8 @@ class ValueIteration:
     mirror : str
         Entry of the state, or ``"target"``, by whose sign the submitted table is mirrored. Empty: none.
     relaxed : str
-        Id of the task whose solution bounds this one from above, in place of an own grid. It is looked up at
-        the entries `keep` of the state.
+        Id of the task whose solution bounds this one from above, in place of a grid of its own. It is
+        looked up at the entries `keep` of the state.
     """
 
     axes: tuple[Axis, ...] = ()

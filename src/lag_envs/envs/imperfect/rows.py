@@ -1,4 +1,4 @@
-"""Rows of which some are stored several times."""
+"""Rows, some of which are stored several times."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Ring(NamedTuple):
 
 
 class RowsWithRings(Rows):
-    """Rows of which some are in rings; the arguments are those of `Rows`."""
+    """Rows, some of which are in rings; the arguments are those of `Rows`."""
 
     def whole(self, number: object) -> str:
         """Return a whole number as printed, of the type of the indices."""

@@ -484,7 +484,7 @@
   const idly = globalThis.requestIdleCallback?.bind(globalThis) ?? ((work) => setTimeout(work, 20));
 
   const LACKING = [
-    ["numbers of 64 bits (BigInt)", typeof BigInt === "function"],
+    ["64-bit integers (BigInt)", typeof BigInt === "function"],
     ["drawing (canvas)", typeof CanvasRenderingContext2D === "function"],
     ["animation (requestAnimationFrame)", typeof requestAnimationFrame === "function"],
   ];
