@@ -267,7 +267,8 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in t
             "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
             "reward_scale": 1.0, "episode_share": 1.0, "actor": [64, 64], "critic": [128, 128],
             "first_layer_scale": 3.0,
-        }
+        },
+        "td3": SwingUp.hyperparameters["td3"],
     }  # fmt: skip
 
     difficulty = (
@@ -315,7 +316,8 @@ class SwingUpTriple(SwingUp):  # noqa: D101
             "reward_scale": 1.0,
             "episode_share": 1.0,
             "actor": [64, 64],
-        }
+        },
+        "td3": SwingUp.hyperparameters["td3"],
     }
     difficulty = (
         "Three unstable bars share one control. The chain has to arrive upright with all three bars nearly "
@@ -462,7 +464,8 @@ class SwingUpAnywhere(SwingUp):
         "fast_ppo": {
             "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "gae_lambda": 0.8,
             "clip_range": 0.1, "noise_steps": 2, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
-        }
+        },
+        "td3": SwingUp.hyperparameters["td3"],
     }  # fmt: skip
 
     controllers = {
