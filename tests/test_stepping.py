@@ -91,7 +91,9 @@ def test_every_task_is_one_certified_step():
             if bound.order:
                 pendulums.add(name)
                 assert bound.substeps <= (1 if bound.order == 14 else 2), (name, case)
-                assert 0.0 < bound.bounds["theta"] < bound.bounds["theta_dot"] <= 1e-12, (name, case)
+                speed = abs(case[0][form_of(task.scene).angle + 1])
+                size = 1.0 if bound.substeps == 1 else max(1.0, speed)
+                assert 0.0 < bound.bounds["theta"] < bound.bounds["theta_dot"] <= 1e-12 * size, (name, case)
     assert len(pendulums) == 9
 
 

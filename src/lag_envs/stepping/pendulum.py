@@ -281,7 +281,7 @@ def largest_majorant(dt: float, order: int = ORDER) -> float:
     Examples
     --------
     >>> round(largest_majorant(0.02) / 2, 3)
-    0.162
+    0.163
     """
     x = 0.3
     for _ in range(60):
