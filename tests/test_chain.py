@@ -277,9 +277,10 @@ def test_mpc_from_recorded_plans_is_the_same_alone():
             break
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "least"),
-    [(chain.SwingUp, 448.0), slow(chain.SwingUpWeak, 405.0), slow(chain.SwingUpTriple, 405.0)],
+    [(chain.SwingUp, 448.0), (chain.SwingUpWeak, 405.0), (chain.SwingUpTriple, 405.0)],
     ids=lambda one: getattr(one, "id", ""),
 )
 def test_mpc_from_recorded_plans_holds_all_bars(kind, least):

@@ -80,7 +80,7 @@ def test_it_has_the_bits_of_the_unfused_step_on_users_tasks_too(kind):
 
 
 @pytest.mark.parametrize("mode", [MODES[0], *map(slow, MODES[1:])])
-@pytest.mark.parametrize("kind", [CHOICES, *LEARNED[:1]], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [CHOICES, *map(slow, LEARNED[:1])], ids=lambda kind: kind.__name__)
 def test_episodes_are_those_of_the_environments(kind, mode):
     """Over ends and starts, in each mode, to rounding: the environments' own step is fused."""
     n, options = 6, {"max_episode_steps": 15, "autoreset_mode": mode}

@@ -119,7 +119,7 @@ def test_spinning_does_not_pay(env_id, state, share):
     [
         slow(Reach.id, [-0.5 * math.pi, 0.0, 0.0, 0.0]),
         slow(Reach.id, [0.3, 0.0, math.pi, 0.0]),
-        (AcrobotReal.id, [math.pi, 0.0, 0.0, 0.0]),
+        slow(AcrobotReal.id, [math.pi, 0.0, 0.0, 0.0]),
         slow(AcrobotReal.id, [0.0, 0.0, math.pi, 0.0]),
         (RotarySwingUp.id, [0.0, 0.0, 0.0, 0.0]),
         (SwingUp.id, [0.0, 0.0, 0.0, 0.0, math.pi, 0.0]),
@@ -245,6 +245,7 @@ def test_renewing_the_recorded_plan_is_better(kind, gain):
     assert (renewed > followed + gain).all()
 
 
+@pytest.mark.slow
 def test_renewed_plans_are_the_same_alone_and_after_a_restart():
     task = make_task(PendubotReal.id)
     agents, read, model = [build(task, "MPC") for _ in range(2)], ObservationDecoder(task), Model(task)
