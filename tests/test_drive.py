@@ -291,6 +291,7 @@ def test_part_of_an_episode_has_no_score(drive):
     assert "score" not in message(page) and reading(page, "Score") == "–"
 
 
+@pytest.mark.slow
 def test_while_watching_the_keys_are_said_to_be_silent(drive, link):
     """After the end, the button and the keys start a drive of one's own on the same start."""
     half = replay.unpack(link.keys, 1)[:30]
@@ -488,6 +489,7 @@ def test_choices(drive, owned):
     shows(page, "s\u0308", "0.00 m/s²")
 
 
+@pytest.mark.slow
 def test_nothing_acts(drive, owned):
     page = drive("OwnDrift-v0", folder=owned)
     assert "nothing to control here" in message(page)

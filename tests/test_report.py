@@ -83,6 +83,7 @@ def test_a_line_that_was_cut_off(tmp_path):
     assert [r.name for r in load_results(file)] == ["works", "two"]
 
 
+@pytest.mark.slow
 def test_timings_run_alone(tmp_path):
     alone = [replace(job(f"alone {i}", "waits", seconds=0.2), alone=True) for i in range(2)]
     begin = time.monotonic()

@@ -35,6 +35,7 @@ def runs():
     return [*rows, *conservation.energy_imbalance("CylinderInCylinder, tilt", 20)]
 
 
+@pytest.mark.slow
 def test_claims_hold(runs):
     content = conservation.content(runs, [])
     assert set(claims(content).values()) == {True}, content.claims
@@ -45,6 +46,7 @@ def test_claims_hold(runs):
         assert picture.draw().axes
 
 
+@pytest.mark.slow
 def test_energy_of_lag_envs_and_of_others(runs):
     """lag_envs is at rounding; Verlet's drift is bounded and RK4's grows, as in theory."""
     drift = {(r["name"], r["method"]): r for r in runs if r["kind"] == "drift"}

@@ -123,6 +123,7 @@ def test_jobs_can_be_sent(section, quick):
 # --- stiff and extreme cases ---
 
 
+@pytest.mark.slow
 def test_verdicts():
     """All of the quick report's cases are met: accurate as expected, or refused as expected."""
     rows = list(stability.extreme_errors(extremes.QUICK))
