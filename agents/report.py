@@ -21,6 +21,7 @@ IMAGES = "images"
 ADAPTER = Path(__file__).with_name("results") / "adapter.json"
 OPTIMA = Path(__file__).with_name("results") / "optimum"
 BEHAVIOUR = Path(__file__).with_name("results") / "behaviour.json"
+REAL_TIME = Path(__file__).with_name("results") / "real_time.json"
 DOCS = Path(__file__).parents[1] / "docs"
 
 # --- the page -----------------------------------------------------------------------------------------------
@@ -47,6 +48,7 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else [])]
         parts += [_range(env_id, env), *_optimum(env_id)]
         parts += [_env_table(env, data["episodes"]), *_times(env), *_behaviour(env_id)]
+        parts += _real_time(env_id)
         parts += [_problems(env)] if env.get("problems") else []
         parts.append(
             _image(f"agents-robustness-{env_id}.png", f"{env_id}: every agent under every condition")
@@ -227,6 +229,30 @@ def _behaviour(env_id: str) -> list[str]:
     if any(name.startswith("lost") for name in head):
         text += " *Lost* is the sum of 1 minus the reward over the steps."
     return [text, markdown_table(head, rows)]
+
+
+def _real_time(env_id: str) -> list[str]:
+    """Return the measurements of `python -m agents.real_time`."""
+    if not REAL_TIME.exists():
+        return []
+    found = json.loads(REAL_TIME.read_text(encoding="utf-8"))
+    told = []
+    for name, row in found["envs"].get(env_id, {}).items():
+        ms = {what: f"{1e3 * row[what]:.3g} ms" for what in ("interval", "median", "p99", "longest")}
+        late = f"{row['late']:.2%}" if row["late"] else "none"
+        text = (
+            f"In {found['clocked']} episodes by the clock, a call of {name} took {ms['median']} (median),"
+            f" {ms['p99']} (99 %) and {ms['longest']} (longest); {late} exceeded the interval of"
+            f" {ms['interval']}."
+        )
+        if row["allowed"] is not None:
+            text += (
+                f" In real time its plans are made {1e3 * row['allowed']:.3g} ms ahead, in a process of their"
+                f" own. That costs {plus_minus(*row['loss'])} of the return, measured in {found['episodes']}"
+                f" other episodes, and leaves {plus_minus(*row['return'])}."
+            )
+        told.append(text)
+    return ["**In real time** (`python -m agents.real_time`). " + " ".join(told)] if told else []
 
 
 def _problems(env: Data) -> str:

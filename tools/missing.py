@@ -29,13 +29,14 @@ COMMANDS = {
     "value iteration": "python -m agents.optimum ID",
     "agents": "python -m agents.results --envs ID",
     "behaviour": "python -m agents.behaviour ID",
+    "real time": "python -m agents.real_time ID",
     "board": "lag-envs leaderboard open",
     "speed": "make bench-docs",
     "accuracy": "make report ARGS='--docs .'",
     "picture": "python -m tools.docs --pictures",
 }
 #: Items that only some environments have.
-SOME = ("plan", "value iteration", "behaviour", "board", "accuracy", "picture")
+SOME = ("plan", "value iteration", "behaviour", "real time", "board", "accuracy", "picture")
 
 
 def have(what: str) -> list[str]:
@@ -54,6 +55,8 @@ def missing(env_id: str) -> dict[str, str]:
         for_all.append("plan")
     if task.goal:
         for_all += ["behaviour", "board", "picture"]  # of the agents on the board, and of the best one
+    if any(found.real_time for found in task.controllers.values()):
+        for_all.append("real time")
     if not task.imperfections:
         for_all.append("accuracy")
     return {what: COMMANDS[what].replace("ID", env_id) for what in for_all if env_id not in _there(what)}
@@ -76,6 +79,8 @@ def _there(what: str) -> frozenset[str]:
             found = _json(results / "summary.json")["envs"]
         case "behaviour":
             found = _json(results / "behaviour.json")["envs"]
+        case "real time":
+            found = _json(results / "real_time.json")["envs"]
         case "board":
             found = _scales()
         case "speed":

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -16,7 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar, cast
@@ -100,6 +101,39 @@ def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
     pool = ProcessPool(count, context=context, initializer=_begin, initargs=(begin, args))
     pool._pool_manager = Manager(pool._pool_manager.context, context)
     return pool
+
+
+class Elsewhere:
+    """A copy of an object in a process of its own, which ends with this one.
+
+    Parameters
+    ----------
+    thing : object
+        What is copied, with cloudpickle.
+    """
+
+    def __init__(self, thing: Any) -> None:
+        import cloudpickle  # a dependency of Gymnasium
+
+        context = multiprocessing.get_context("spawn")
+        begin = (_receive, [cloudpickle.dumps(thing)])
+        self._pool = ProcessPoolExecutor(1, context, _begin, begin)
+
+    def call(self, method: str, *args: Any) -> Future:
+        """Call a method of the copy; calls are worked on one after the other."""
+        return self._pool.submit(_call, method, args)
+
+
+_copy: Any = None
+
+
+def _receive(thing: bytes) -> None:
+    global _copy
+    _copy = pickle.loads(thing)
+
+
+def _call(method: str, args: Sequence[Any]) -> Any:
+    return getattr(_copy, method)(*args)
 
 
 def _begin(begin: Callable | None, args: Sequence[Any]) -> None:

@@ -67,7 +67,7 @@ def controllers(task: Any) -> dict[str, Controller]:
     return KNOW_NOTHING | dict(task.controllers)
 
 
-def build(task: Any, name: str, **numbers: Any) -> Any:
+def build(task: Any, name: str, *, real_time: bool = False, **numbers: Any) -> Any:
     """Return a task's controller of this name.
 
     Parameters
@@ -76,13 +76,18 @@ def build(task: Any, name: str, **numbers: Any) -> Any:
         The task, ``env.unwrapped.task``.
     name : str
         Name of the controller.
+    real_time : bool
+        Whether it has to act in time with a clock. One whose planning takes longer than a step then plans
+        some steps ahead, in a process of its own: see `ahead` of `lag_envs.controllers.mpc.MPC`.
     **numbers
         Keywords that override those of the task's record.
     """
     found = controllers(task)
     if name not in found:
         raise ValueError(f"{task.id or type(task).__name__} has no controller {name!r}; {hint(name, found)}")
-    return resolve(found[name].place)(task, **(dict(found[name].numbers) | numbers))
+    made = found[name]
+    hurry = {**made.real_time, "background": True} if real_time and made.real_time else {}
+    return resolve(made.place)(task, **{**made.numbers, **hurry, **numbers})
 
 
 def plan(task: Any, *, guess: str) -> ILQR:

@@ -103,7 +103,7 @@ def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: 
     )
 
 
-def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **numbers: Any) -> MPC:
+def rescued(task: Balance, *, weights: Mapping[str, float], trial: int = 60, **numbers: Any) -> MPC:
     """Return a regulator that hands over to an MPC in states from which it would lose the bars.
 
     Parameters
@@ -112,7 +112,7 @@ def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **n
         The task, ``env.unwrapped.task``.
     weights : mapping
         Weights of the regulator, see `BalanceLQR`.
-    ahead : int
+    trial : int
         For how many steps without kicks the regulator must keep the bars upright.
     **numbers
         Other arguments of `MPC`.
@@ -125,7 +125,7 @@ def rescued(task: Balance, *, weights: Mapping[str, float], ahead: int = 60, **n
 
     def survives(states: Array) -> NDArray[np.bool_]:
         alive, forever = np.ones(len(states), np.bool_), np.full(len(states), np.inf)
-        for _ in range(ahead):
+        for _ in range(trial):
             states, _, ended = model(states, holding.act(states, forever, forever))
             alive &= ~ended
         return alive

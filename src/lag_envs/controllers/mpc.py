@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +18,18 @@ from lag_envs.controllers.tracking import Tracking, hold, recorded, smoothed, wa
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Plans
 from lag_envs.tasks.track import GuardedTrack
+from lag_envs.workers import Elsewhere
 
 Tail = Callable[[Array], Array]
+
+
+class Coming(NamedTuple):
+    """Plans in the making."""
+
+    left: int  # calls of `predict` until they are followed
+    rows: NDArray[np.intp]  # their episodes
+    wanted: NDArray[np.bool_]  # which of these have not ended in the meantime
+    made: Future  # an `Ahead` of these rows
 
 
 class Ahead(NamedTuple):
@@ -29,6 +40,7 @@ class Ahead(NamedTuple):
     states: Array  # (n, horizon, n_state)
     actions: Array  # (n, horizon, n_actions)
     gains: Array  # (n, horizon, n_actions, n_state)
+    coming: tuple[Coming, ...] = ()
 
 
 class MPC:
@@ -52,6 +64,12 @@ class MPC:
         searched for at the start, and all plans are followed by the feedback that `Task.plans` specifies.
     every : int
         Steps after which a plan is renewed.
+    ahead : int
+        Steps that a renewal may take, searches included. It begins with the state predicted for its end, and
+        the old plan is followed until then. An episode's first plan is made before the episode goes on.
+    background : bool
+        Whether a process of its own makes the plans, so that `predict` returns at once, as real time demands,
+        and waits only for a plan that is not ready in `ahead` steps. The actions are the same.
     iterations : int
         Iterations of iLQR for a renewal.
     budget : int
@@ -89,6 +107,8 @@ class MPC:
         horizon: int = 50,
         first: Sequence[Tracking] = (),
         every: int = 1,
+        ahead: int = 0,
+        background: bool = False,
         iterations: int = 2,
         budget: int = 200_000,
         guesses: int = 16,
@@ -112,6 +132,10 @@ class MPC:
         ):
             if number < 1:
                 raise ValueError(f"{name} must be at least 1, got {number}")
+        if ahead < 0:
+            raise ValueError(f"ahead must be at least 0, got {ahead}")
+        if background and not ahead:
+            raise ValueError("background=True needs `ahead`, the number of steps that a renewal may take")
         if not 0.0 <= reserve < 1.0:
             raise ValueError(f"reserve must be at least 0 and less than 1, got {reserve}")
         if first and task.plans is None:
@@ -125,6 +149,7 @@ class MPC:
         horizon = int(min(horizon, task.limit))
         self.task, self.horizon, self.finer = task, horizon, finer
         self.every, self.over = min(every, horizon) * finer, horizon * finer
+        self.ahead = ahead
         self.first, self.plans = first, plans or task.plans
         self.model = smoothed(task) if first else task
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
@@ -142,6 +167,10 @@ class MPC:
         for method in (self.planner, self.polisher, self.searcher):
             method.largest *= 1.0 - reserve
         self.share = np.asarray(searched.limit_control / task.limit_control)
+        self._elsewhere = None
+        if background:
+            self._elsewhere = Elsewhere(self)
+            self._elsewhere.call("_warm_up").result()
 
     def predict(
         self,
@@ -153,54 +182,105 @@ class MPC:
         """Return the action for each observation; the state holds the plans."""
         values = np.asarray(observation)
         x, targets = self.read(values.reshape(-1, values.shape[-1]))
-        n, width = x.shape
+        n = len(x)
         fresh = beginning(n, state, episode_start)
         if state is None:
-            many, blank = (n, self.horizon), np.zeros(n, np.intp)
-            acting = np.zeros((*many, self.count)), np.zeros((*many, self.count, width))
-            state = Ahead(blank, blank, np.zeros((*many, width)), *acting)
-        plan = state._replace(**{name: getattr(state, name).copy() for name in state._fields})
+            state = self._blank(x)
+        plan = _part(state, np.arange(n))
         plan.wait[:] = np.where(fresh, 0, np.maximum(plan.wait - 1, 0))
         plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = self.idle, 0.0, x[fresh, None]
+        coming, busy = self._arrive(plan, state.coming, fresh)
         rows, held = np.arange(n), np.zeros(n, np.bool_) if self.holds is None else self.holds(x)
         off = np.abs(self._followed(plan, rows, plan.step, x)[0]).max(axis=1)
-        renewed = ~held & (fresh | (plan.step >= self.every) | (off > self.surprise))
-        if renewed.any():
-            self._renew(plan, np.flatnonzero(renewed), x, targets, fresh)
-        _, action = self._followed(plan, rows, plan.step, x)
+        renewed = ~held & ~fresh & ~busy & ((plan.step >= self.every) | (off > self.surprise))
+        for chosen, first in ((fresh & ~held, True), (renewed, False)):
+            if (those := np.flatnonzero(chosen)).size:
+                made = self._made(_part(plan, those), x[those], targets[those], first)
+                if first or not self.ahead:
+                    self._keep(plan, those, made.result())
+                else:
+                    coming.append(Coming(self.ahead * self.finer, those, np.ones(len(those), np.bool_), made))
+        action = self._following(plan)(x, targets, 0)
         if held.any():
             action = np.where(held[:, None], self._holding(x, targets), action)
         plan.step[:] = np.where(held, self.over, plan.step + 1)
-        clipped = np.clip(action, -self.largest, self.largest).astype(np.float32)
-        return clipped.reshape(*values.shape[:-1], self.count), plan
+        actions = self._clipped(action).reshape(*values.shape[:-1], self.count)
+        return actions, plan._replace(coming=tuple(coming))
 
-    def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
-        """Plan again for some of the episodes."""
-        if self.first:
-            begun, rows = rows[fresh[rows]], rows[~fresh[rows]]
-            if len(begun):
-                self._keep(plan, begun, self._begin(x[begun], targets[begun]))
-            if not len(rows):
-                return
-        found, value = self.planner.improve(x[rows], targets[rows], self._following(plan, rows))
-        bad = (fresh[rows] | self._ends_badly(found.states, found.actions, targets[rows])) & (
-            plan.wait[rows] == 0
-        )
-        if bad.any():
-            those = rows[bad]
-            plan.wait[those] = self.pause
-            other, gain = self._search(x[those], targets[those])
-            better = np.flatnonzero(bad)[gain > value[bad]]
-            for name in ("states", "actions", "gains"):
-                getattr(found, name)[better] = getattr(other, name)[gain > value[bad]]
-        self._keep(plan, rows, found)
+    def _blank(self, x: Array) -> Ahead:
+        """Return no plans."""
+        (n, width), none = x.shape, np.zeros(len(x), np.intp)
+        actions, gains = ((n, self.horizon, self.count, *more) for more in ((), (width,)))
+        return Ahead(none, none, np.zeros((n, self.horizon, width)), np.zeros(actions), np.zeros(gains))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_elsewhere": None}
+
+    def _clipped(self, action: Array) -> NDArray[np.float32]:
+        """Return actions as the environment gets them."""
+        return np.clip(action, -self.largest, self.largest).astype(np.float32)
+
+    def _arrive(
+        self, plan: Ahead, made: Sequence[Coming], fresh: NDArray[np.bool_]
+    ) -> tuple[list[Coming], NDArray[np.bool_]]:
+        """Store plans whose time has come; return the others, and which episodes wait for one."""
+        coming, busy = [], np.zeros(len(fresh), np.bool_)
+        for one in made:
+            wanted = one.wanted & ~fresh[one.rows]
+            if one.left > 1:
+                coming.append(one._replace(left=one.left - 1, wanted=wanted))
+                busy[one.rows[wanted]] = True
+            elif wanted.any():
+                self._keep(plan, one.rows[wanted], _part(one.made.result(), wanted))
+        return coming, busy
 
     @staticmethod
-    def _keep(plan: Ahead, rows: NDArray[np.intp], found: Any) -> None:
+    def _keep(plan: Ahead, rows: NDArray[np.intp], found: Ahead) -> None:
         """Store new plans."""
         for name in ("states", "actions", "gains"):
             getattr(plan, name)[rows] = getattr(found, name)
-        plan.step[rows] = 0
+        plan.step[rows], plan.wait[rows] = 0, np.maximum(plan.wait[rows], found.wait)
+
+    def _made(self, *arguments: Any) -> Future:
+        """Return the result of `_make`, which another process may still work on."""
+        if self._elsewhere:
+            return self._elsewhere.call("_make", *arguments)
+        made: Future = Future()
+        made.set_result(self._make(*arguments))
+        return made
+
+    def _make(self, old: Ahead, x: Array, targets: Array, first: bool) -> Ahead:
+        """Return plans that begin `ahead` steps after these states, or there if they are episodes' first."""
+        none = np.zeros(len(x), np.intp)
+        if first and self.first:
+            begun = self._begin(x, targets)
+            return Ahead(none, none, begun.states, begun.actions, begun.gains)
+        if not first:
+            old, x = self._later(old, x, targets)
+        found, value = self.planner.improve(x, targets, self._following(old))
+        bad = (old.wait == 0) & (first | self._ends_badly(found.states, found.actions, targets))
+        if bad.any():
+            other, gain = self._search(x[bad], targets[bad])
+            better = np.flatnonzero(bad)[gain > value[bad]]
+            for name in ("states", "actions", "gains"):
+                getattr(found, name)[better] = getattr(other, name)[gain > value[bad]]
+        return Ahead(none, np.where(bad, self.pause, 0), found.states, found.actions, found.gains)
+
+    def _warm_up(self) -> None:
+        """Make a plan of each kind, which compiles everything."""
+        x, targets = np.array([self.task.centre]), np.zeros((1, *np.shape(self.task.target_range)))
+        rng, self.rng = self.rng, np.random.default_rng(0)
+        for first in (True, False):
+            self._make(self._blank(x), x, targets, first)
+        self.rng = rng
+
+    def _later(self, old: Ahead, x: Array, targets: Array) -> tuple[Ahead, Array]:
+        """Return plans and states after `ahead` steps."""
+        act = self._following(old)
+        for t in range(self.ahead):
+            actions = self._clipped(act(x, targets, t)).astype(np.float64)
+            x, _, _ = self.planner.advance(x, actions, targets)
+        return old._replace(step=old.step + self.ahead * self.finer), x
 
     def _followed(self, plan: Ahead, rows: Any, step: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
         """Return how far states (n, n_state) are off plans at some of their steps, and the actions."""
@@ -209,11 +289,12 @@ class MPC:
         off = self.read.difference(x, planned + (part / self.finer)[:, None] * (after - planned))
         return off, plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
 
-    def _following(self, plan: Ahead, rows: NDArray[np.intp]) -> Feedback:
+    def _following(self, plan: Ahead) -> Feedback:
         """Return the feedback that follows plans to their ends, and holds there."""
+        rows = np.arange(len(plan.step))
 
         def act(x: Array, targets: Array, t: int) -> Array:
-            step = plan.step[rows] + t * self.finer
+            step = plan.step + t * self.finer
             _, action = self._followed(plan, rows, step, x)
             over = (step >= self.over)[:, None]
             if not over.any():
@@ -271,6 +352,11 @@ class MPC:
         found, values = method.improve(np.repeat(x, m, axis=0), np.repeat(targets, m, axis=0), guesses)
         best = values.reshape(-1, m).argmax(axis=1) + m * np.arange(len(x))
         return found._replace(**{name: getattr(found, name)[best] for name in ("states", "actions", "gains")})
+
+
+def _part(plan: Ahead, rows: NDArray) -> Ahead:
+    """Return copies of the plans of some episodes, without those in the making."""
+    return Ahead(*(values[rows] for values in plan[:-1]))
 
 
 def planner(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,8 +93,8 @@ class Model:
         self._n_state = program.n_state
         self._reversed: dict[tuple[str, ...], Reverse] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_reversed": {}}  # compiled, and made again on use
+    def __reduce__(self) -> tuple[type[Model], tuple[Task]]:
+        return Model, (self.task,)  # what is compiled is made again
 
     def __call__(
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None

@@ -293,6 +293,7 @@ class AcrobotReal(Task):
             "lag_envs.controllers.mpc:renewed",
             {"finer": 5, "every": 5, "iterations": 3, "surprise": math.inf, "reserve": 0.05},
             plans=True,
+            real_time={"ahead": 8, "every": 1},
         ),
     }
     plans = Plans(
@@ -344,10 +345,10 @@ class AcrobotReal(Task):
         "The LQR is that of the project's leaderboard. It only holds links that are upright already; it "
         "does not swing up hanging ones. The plan was found on the exact model with friction; its feedback "
         "comes from a model without dry friction. MPC begins with that plan or its mirror image, and renews "
-        "it on the way up, which brings the links up sooner. It is fast enough on average, but a single "
-        "renewal takes as long as many steps; and with wrong parameters MPC is no more reliable than the "
-        "plan. Learners stay below the plan on average, and their seeds differ much. TD3, SAC and TQC hold "
-        "their noise for many steps. The PPO in one file takes many more steps, and less time."
+        "it on the way up, which brings the links up sooner; but with wrong parameters it is no more "
+        "reliable than the plan. Learners stay below the plan on average, and their seeds differ much. TD3, "
+        "SAC and TQC hold their noise for many steps. The PPO in one file takes many more steps, and less "
+        "time."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -423,5 +424,6 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (AcrobotReal's docstring, adapted
             "lag_envs.controllers.mpc:renewed",
             {"finer": 5, "every": 2, "iterations": 3, "surprise": math.inf, "reserve": 0.05},
             plans=True,
+            real_time={"ahead": 8, "every": 1},
         ),
     }

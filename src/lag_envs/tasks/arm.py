@@ -95,6 +95,7 @@ class Reach(Task):
             "lag_envs.controllers.mpc:planner",
             {"horizon": 50, "every": 5, "iterations": 3, "guesses": 32},
             plans=True,
+            real_time={"ahead": 5, "every": 1},
         ),
     }
     reference = "computed torque"

@@ -261,6 +261,7 @@ class CartPoleContinuous(_OnTrack):
                 "weights": {"x": 3.0, "x_dot": 10.0, "theta": 100.0, "theta_dot": 10.0},
             },
             plans=True,
+            real_time={"ahead": 2, "every": 1},
         ),
     }  # fmt: skip
     reference = "LQR"
@@ -412,6 +413,7 @@ class CartPoleSwingUp(_OnTrack):
                 "pause": 20,
             },
             plans=True,
+            real_time={"ahead": 2, "every": 8},
         ),
     }
     plans = Plans(

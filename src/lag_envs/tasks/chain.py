@@ -143,7 +143,7 @@ class SwingUp(GuardedTrack, _ChainTask):
         "LQR": Controller("lag_envs.controllers.tracking:hold"),
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
         "iLQR": Controller("lag_envs.controllers.chain:replan", plans=True),
-        "MPC": Controller("lag_envs.controllers.mpc:renewed", plans=True),
+        "MPC": Controller("lag_envs.controllers.mpc:renewed", plans=True, real_time={"ahead": 4}),
     }
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0]},
@@ -296,7 +296,10 @@ class SwingUpTriple(SwingUp):  # noqa: D101
         **{name: SwingUp.controllers[name] for name in ("LQR", "plan + TVLQR")},
         # What the regulator would lose is known for small deviations only, which here means very small ones.
         "MPC": Controller(
-            "lag_envs.controllers.mpc:renewed", {"beyond": 1.0, "every": 2, "near": 0.05}, plans=True
+            "lag_envs.controllers.mpc:renewed",
+            {"beyond": 1.0, "every": 2, "near": 0.05},
+            plans=True,
+            real_time={"ahead": 4, "every": 1},
         ),
     }
 
@@ -352,6 +355,7 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
             "lag_envs.controllers.filtering:renewed_filtered",
             {"effort": 1.0, "drift": 0.01, "beyond": 1.0, "every": 10, "surprise": math.inf, "near": 0.1},
             plans=True,
+            real_time={"ahead": 4, "every": 6},
         ),
     }
     open = Open(
@@ -470,7 +474,9 @@ class SwingUpAnywhere(SwingUp):
 
     controllers = {
         "LQR": Controller("lag_envs.controllers.tracking:hold"),
-        "MPC": Controller("lag_envs.controllers.chain:anywhere", plans=True),
+        "MPC": Controller(
+            "lag_envs.controllers.chain:anywhere", plans=True, real_time={"ahead": 60, "every": 30}
+        ),
     }
     difficulty = (
         "No two episodes need the same swing-up, so one has to be found each time, by planning or by a "
@@ -596,6 +602,7 @@ class Balance(_ChainTask):
                 "horizon": 40, "every": 2, "iterations": 5, "budget": 45_000, "good": 20.0,
             },
             plans=True,
+            real_time={"ahead": 4, "every": 1, "budget": 10_000},
         ),
     }  # fmt: skip
     examples = Examples(

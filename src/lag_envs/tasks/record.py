@@ -58,12 +58,15 @@ class Controller:
         Keywords that ``python -m agents.tune`` optimises, and the range of each.
     plans : bool
         Whether it plans for some seconds before each episode.
+    real_time : mapping, optional
+        For one whose planning takes longer than a step: the numbers with which it acts in real time.
     """
 
     place: str
     numbers: Mapping[str, Any] = field(default_factory=dict)
     tune: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     plans: bool = False
+    real_time: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,7 @@ class RotarySwingUp(Task):
                 "rest": {"theta": math.pi},
             },
             plans=True,
+            real_time={"ahead": 4, "every": 6},
         ),
     }  # fmt: skip
     plans = Plans(
