@@ -121,7 +121,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="episodes for returns (default %(default)s)",
     )
     p.add_argument(
-        "--output", type=Path, default=OUTPUT, metavar="FILE", help="results as JSON (default %(default)s)"
+        "--output",
+        type=Path,
+        default=OUTPUT,
+        metavar="FILE",
+        help="results as JSON (default agents/results/real_time.json)",
     )
     args = p.parse_args(arguments)
     for name, least in (("clocked", 1), ("episodes", 2)):

@@ -17,7 +17,6 @@ from lag_envs.controllers.swing_up import away
 from lag_envs.controllers.tracking import Tracking, hold, recorded, smoothed, waves
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Plans
-from lag_envs.tasks.track import GuardedTrack
 from lag_envs.workers import Elsewhere
 
 Tail = Callable[[Array], Array]
@@ -393,9 +392,7 @@ def planner(
 def loss(task: Task) -> Callable[[Array], Array]:
     """Return the best regulator's loss of reward from states near upright; farther off, a larger one."""
     read, rest = ObservationDecoder(task), np.array(task.plans.rest)
-    # Rewards ignore where on the track a support stands; something has to draw it back.
-    extra = {"s": 0.02 / task.length**2} if isinstance(task, GuardedTrack) else {}
-    _, cost = regulator(smoothed(task), rest, extra=extra)
+    _, cost = regulator(smoothed(task), rest, extra=task.plans.extra)
 
     def lost(states: Array) -> Array:
         off = read.difference(states, rest)

@@ -201,6 +201,7 @@ because all starts are close together. TD3 learns from fewer steps than the PPO 
             rest=(0.0, 0.0, *(math.pi, 0.0) * self.scene.bars),
             weights=weights,
             effort=0.02,
+            extra={"s": 0.02 / self.length**2},  # something has to draw the support back
         )
 
     @property
@@ -355,7 +356,7 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
             "lag_envs.controllers.filtering:renewed_filtered",
             {"effort": 1.0, "drift": 0.01, "beyond": 1.0, "every": 10, "surprise": math.inf, "near": 0.1},
             plans=True,
-            real_time={"ahead": 4, "every": 6},
+            real_time={"ahead": 4},
         ),
     }
     open = Open(

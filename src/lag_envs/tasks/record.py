@@ -95,6 +95,8 @@ class Plans:
         Weights of the feedback: squares of deviations, by entry of the state.
     effort : float
         Weight of the square of an action's deviation.
+    extra : mapping of str to float
+        Costs of the squares of entries of the state that the reward ignores, in a step near the end.
     smooth : mapping
         Parameters of the scene that differ in the model of the feedback: dry friction is so steep at rest
         that its linearisation misleads.
@@ -111,6 +113,7 @@ class Plans:
     rest: Sequence[float]
     weights: Mapping[str, float]
     effort: float
+    extra: Mapping[str, float] = field(default_factory=dict)
     smooth: Mapping[str, float] = field(default_factory=dict)
     of: str = ""
 
