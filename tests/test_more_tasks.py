@@ -266,6 +266,24 @@ def test_renewed_plans_are_the_same_alone_and_after_a_restart():
     assert memory.step.tolist() == [6, 3]
 
 
+def test_a_value_that_overflows_loses_no_plan(monkeypatch):
+    """At rest dry friction is so steep that the value grows without limit."""
+    task = make_task(AcrobotReal.id)
+    agent = build(task, "MPC", ahead=8)
+    solve, finite = agent.planner._solve, []
+
+    def watched(*args):
+        change, gains = solve(*args)
+        finite.append(np.isfinite(change).all())
+        return change, gains
+
+    monkeypatch.setattr(agent.planner, "_solve", watched)
+    x = np.array([task.centre])
+    plan = agent._make(agent._blank(x), x, np.zeros(1), False)
+    assert not all(finite)
+    assert np.isfinite(plan.actions).all() and np.isfinite(plan.gains).all()
+
+
 def test_between_the_steps_of_a_plan_feedback_acts_on_the_line_between_its_states():
     task = make_task(PendubotReal.id)
     agent, read = build(task, "MPC", every=3), ObservationDecoder(task)

@@ -196,7 +196,11 @@ class ILQR:
         going = np.arange(n)
         for iteration in range(self.iterations + (self.gains is None)):
             slopes = self._expand(plan.states[going], plan.actions[going], targets[going])
-            change, gains = self._solve(plan.actions[going], damping[going], *slopes)
+            with np.errstate(over="ignore", invalid="ignore"):
+                change, gains = self._solve(plan.actions[going], damping[going], *slopes)
+            # Where the value overflows, nothing changes, and the next iteration has more damping.
+            lost = ~(np.isfinite(change) & np.isfinite(gains).all(axis=3)).all(axis=(1, 2))
+            change[lost], gains[lost] = 0.0, 0.0
             plan.gains[going] = gains
             if iteration == self.iterations:
                 break
