@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from agents.results import ROOT, results_json
 from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds, reports_errors
 from lag_envs import TASKS
-from lag_envs.controllers import build
+from lag_envs.controllers import ILQR, build
 from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import mean_and_error, rounded_data
 from lag_envs.host import machine
@@ -35,8 +35,9 @@ CLOCKED, EPISODES = 3, 64
 
 def planning(env_id: str) -> Iterator[str]:
     """Yield the controllers of an environment that plan during an episode."""
-    for name, found in TASKS[env_id].controllers.items():
-        if found.plans and name != "iLQR":  # which plans before it
+    task = TASKS[env_id]()
+    for name, found in task.controllers.items():
+        if found.plans and not isinstance(build(task, name), ILQR):  # which plans before it
             yield name
 
 
