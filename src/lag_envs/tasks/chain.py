@@ -15,7 +15,7 @@ from lag_envs.tasks.record import Controller, Examples, Goal, Open, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 #: Settings of SAC, TD3 and TQC for swinging up. Sixteen steps for each update did best in trials.
-OFF_POLICY = {
+OFF_POLICY: Mapping[str, Mapping[str, Any]] = {
     "off_policy": {
         "n_timesteps": 2e6, "n_envs": 128, "n_steps": 3, "gamma": 0.97, "gradient_steps": 8,
         "buffer_size": 1_000_000, "learning_rate": "lin_2e-3",
