@@ -70,7 +70,7 @@ class Settings(LearnerSettings):
     episode_share: float = Field(gt=0, le=1, description="share of its length at which an episode is cut")
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which that noise is held")
-    log_std_init: float = Field(ge=-20, le=5, description="its log standard deviation at the start")
+    log_std_init: float = Field(ge=-20, le=5, description="log standard deviation of actions at the start")
     frames: int = Field(ge=1, description="observations that actor and critic see: an episode's last ones")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     critic: list[PositiveInt] = Field(min_length=1, description="widths of the critic's hidden layers")

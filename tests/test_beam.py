@@ -139,10 +139,10 @@ def test_what_cannot_work_is_refused():
             BeamSearch(kind())
     task = cart_pole.CartPoleExact()
     for numbers, reason in (
-        ({"horizon": 0}, "horizon must be at least 1, got 0"),
-        ({"width": 0}, "width must be at least 1"),
-        ({"every": 0}, "every must be at least 1"),
-        ({"pause": 0}, "pause must be at least 1"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1, got 0"),
+        ({"width": 0}, "width must be a whole number of at least 1"),
+        ({"every": 0}, "every must be a whole number of at least 1"),
+        ({"pause": 0}, "pause must be a whole number of at least 1"),
         ({"cell": 0.0}, "cell must be above 0"),
         ({"surprise": math.nan}, "surprise must be above 0, got nan"),
         ({"weights": {"thetta": 1.0}}, "weights: there is no 'thetta'; did you mean theta"),

@@ -231,7 +231,7 @@ def test_mpc_for_any_task():
     returns = play(pivoted_bar.Balance.id, agent, SEEDS[:4], duration=1.0)
     assert returns.mean() > 40.0  # of 50; doing nothing gets half of that
     for name in ("horizon", "every", "guesses", "budget", "finer"):
-        with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+        with pytest.raises(ValueError, match=f"{name} must be a whole number of at least 1, got 0"):
             MPC(task, **{name: 0})
     for reserve in (-0.1, 1.0, math.nan):
         with pytest.raises(ValueError, match=f"reserve must be at least 0 and less than 1, got {reserve}"):
@@ -296,7 +296,9 @@ def test_mpc_begins_only_with_plans_of_its_task():
             MPC(task, first=[law])
     unplanned = chain.Balance()
     law = Tracking(unplanned, **{name: getattr(recorded(task), name) for name in Tracking.DATA})
-    with pytest.raises(ValueError, match="first: Balance has no `plans`, which specify the feedback"):
+    with pytest.raises(
+        ValueError, match="Balance has no `plans`, which say how its plans are made and followed"
+    ):
         MPC(unplanned, first=[law])
 
 

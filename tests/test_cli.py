@@ -111,6 +111,16 @@ def run_stub(body, **options):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_no_option_is_abbreviated(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["cache", "--clea"])
+    assert "unrecognized arguments: --clea" in capsys.readouterr().err
+
+
+def test_a_report_has_no_ids(capsys):
+    assert f"{ID} is an id, and the report measures all environments" in told(capsys, "report", ID)
+
+
 def test_sigterm_is_like_ctrl_c():
     body = "try:\n        print('begins', flush=True); time.sleep(60)\n    finally: print('tidies')"
     child = run_stub(body, stdout=subprocess.PIPE)
@@ -222,6 +232,10 @@ def test_watch_takes_agents_by_name_and_by_file(tmp_path):
     (tmp_path / "broken.zip").write_bytes(b"PK")
     with pytest.raises(UserError, match="is not a model of Stable-Baselines3"):
         watch.load_agent(task.id, task, str(tmp_path / "broken.zip"))
+    (tmp_path / "model.zip").touch()
+    (tmp_path / "result.json").write_text('{"env": "Other-v0"}')
+    with pytest.raises(UserError, match=f"is an agent of Other-v0, not of {task.id}"):
+        watch.load_agent(task.id, task, str(tmp_path))
 
 
 def test_watch_takes_a_model_of_stable_baselines3(tmp_path):

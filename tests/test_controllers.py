@@ -24,7 +24,7 @@ from lag_envs.controllers import (
     do_nothing,
     make_controller,
 )  # fmt: skip
-from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.basic import ObservationDecoder, actions_for
 from lag_envs.controllers.ilqr import within
 from lag_envs.controllers.linear import Regulator, regulator, time_varying
 from lag_envs.controllers.lookahead import LookAhead
@@ -390,6 +390,77 @@ def test_what_cannot_work_is_refused():
     for controller in (TiltLQR, ShellPD):
         with pytest.raises(ValueError, match="damping"):
             controller(make_task(SHELL, damping=0.0))
+
+
+class Unseen(cart_pole.CartPoleContinuous):
+    """Observes what does not tell the state linearly."""
+
+    id = ""
+    draws, kick, shown = 0, Task.kick, ()
+
+    def observe(self, after, target, xp):
+        seen = {
+            "x": after.x, "x_dot": after.x_dot, "theta": after.theta, "theta_dot": after.theta_dot,
+            "tip": xp.sin(after.theta) * (1.0 + after.x), "1/x": 1.0 / after.x, "|x|": xp.abs(after.x),
+            "tanh": xp.tanh(after.theta), "sin": xp.sin(after.theta), "cos": xp.cos(after.theta),
+        }  # fmt: skip
+        return {name: seen[name] for name in self.shown}
+
+    def bounds(self):
+        return dict.fromkeys(self.shown, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("shown", "lost"),
+    [
+        (["x", "x_dot", "theta", "theta_dot", "tip"], "tip in the observation"),
+        (["x", "x_dot", "theta", "theta_dot", "1/x"], "1/x in the observation"),
+        (["|x|", "x_dot", "tanh", "theta_dot"], r"\|x\|, tanh in the observation"),
+        (["x", "theta"], "x_dot, theta_dot in the state"),
+        (["x", "x_dot", "sin", "theta_dot"], "theta in the state"),
+        (["x", "x_dot", "sin", "cos", "theta_dot"], ""),
+    ],
+)
+def test_only_what_can_be_read_is_read(shown, lost):
+    task = type("Seen", (Unseen,), {"shown": shown})()
+    numbers = {"weights": {"theta": 1.0}, "effort": 1.0}
+    for make in (lambda: Regulator(task, **numbers), lambda: MPC(task, budget=10), lambda: ILQR(task, [])):
+        if not lost:
+            assert make().read.wrapped == [2]
+            continue
+        with pytest.raises(ValueError, match=f"but not {lost} of Seen: observe every entry of the state"):
+            make()
+
+
+class Levers(own_tasks.Deliver):
+    """Two lists of actions."""
+
+    id = ""
+    action = {"push": [-20.0, 0.0, 20.0], "pull": [0.0, 9.0, 10.0, 11.0, 20.0]}
+
+
+def test_several_lists_get_the_nearest_actions():
+    wanted = np.array([[-19.0, 9.6], [3.0, 30.0], [11.0, 8.0]])
+    assert actions_for(Levers(), wanted).tolist() == [[0, 2], [1, 4], [2, 1]]
+
+
+def test_controllers_need_something_to_do_and_sensible_numbers():
+    idle = own_tasks.Drift()
+    for make in (lambda: MPC(idle), lambda: Regulator(idle, weights={}, effort=1.0)):
+        with pytest.raises(ValueError, match="has nothing to do: Drift has no control to act with"):
+            make()
+    task = cart_pole.CartPoleContinuous()
+    for numbers, reason in (
+        ({"effort": 0.0}, "effort must be finite and above 0, got 0"),
+        ({"effort": math.nan}, "effort must be finite and above 0, got nan"),
+        ({"weights": {"theta": -1.0}}, "weights: that of theta must be finite and at least 0, got -1"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            Regulator(task, **{"weights": {"theta": 1.0}, "effort": 1.0} | numbers)
+    with pytest.raises(ValueError, match=r"horizon must be a whole number of at least 1, got 2\.5"):
+        MPC(task, horizon=2.5)
+    with pytest.raises(ValueError, match="iLQR needs `guesses`"):
+        ILQR(Lopsided(), []).predict(np.zeros(4))
 
 
 # --- tuning ---

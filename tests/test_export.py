@@ -10,6 +10,7 @@ from small_submissions import ABOUT, ENV, network
 
 from agents import measure
 from lag_envs import sb3_policies
+from lag_envs.leaderboard import export
 from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.leaderboard.submission import load, write
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
@@ -154,6 +155,19 @@ def test_command_exports_the_runs_of_a_folder(runs, tmp_path, monkeypatch, capsy
     for seed, policy in made.policies:
         measured = measure._policy(ENV, runs / f"seed{seed}").predict(seen)[0]
         assert measured.tobytes() == policy.agent().predict(seen)[0].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("algo", "name"), [("fast_ppo", "fast PPO"), ("cloning", "cloning"), ("shac", "SHAC"), (None, "PPO")]
+)
+def test_networks_of_our_own_are_called_by_their_learners(algo, name, tmp_path):
+    file = tmp_path / "model.zip"
+    with open(file, "wb") as there:
+        np.savez(there, choices=False, weight_0=np.zeros((1, 4)), bias_0=np.zeros(1))
+    source = export.Source(file, result={"algo": algo} if algo else None)
+    assert export._name(source, None) == name
+    with pytest.raises(export.ExportError, match="holds a network, not a model; leave --algo out"):
+        export._name(source, "sac")
 
 
 def test_command_exports_files(runs, tmp_path):

@@ -155,7 +155,10 @@ def test_mistakes(run):
     for arguments in (["list"], ["show", "x"], ["--help"], ["add", "--jobs", "0"], []):
         if arguments in (["list"], ["show", "x"]):
             status, _, err = run(*arguments)
-            assert status == 2 and "leaderboard has no submissions; `lag-envs leaderboard add" in err
+            assert (
+                status == 2
+                and "no board in leaderboard; --board names the folder of one, and `lag-envs" in err
+            )
         else:
             with pytest.raises(SystemExit) as left:
                 run(*arguments)
@@ -210,6 +213,11 @@ def test_build(run):
 
 
 @pytest.mark.slow
+def test_a_port_and_a_board_that_do_not_exist(run):
+    assert "--port must be a number from 0 to 65535, got 99999999" in run("serve", "--port", "99999999")[1]
+    assert "there is no board in typo; --board names" in run("list", "--board", "typo")[1]
+
+
 def test_serve(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")

@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -92,7 +94,7 @@ def test_controllers_that_do_not_plan_are_the_same_in_real_time():
 
 def test_mistakes():
     task = chain.Balance()
-    with pytest.raises(ValueError, match="ahead must be at least 0, got -1"):
+    with pytest.raises(ValueError, match="ahead must be a whole number of at least 0, got -1"):
         MPC(task, ahead=-1)
     with pytest.raises(ValueError, match="background=True needs `ahead`"):
         MPC(task, background=True)
@@ -117,6 +119,13 @@ def test_an_object_elsewhere():
         there.call("halve", 4).result()
     with pytest.raises(RuntimeError, match="terminated abruptly"):
         there.call("leave").result()
+
+
+def test_a_process_needs_a_file_that_can_be_imported(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text("from lag_envs.workers import Elsewhere\nElsewhere(1)\n")
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert ended.returncode == 1 and "RuntimeError: no process could be started; a script" in ended.stderr
 
 
 @pytest.mark.slow

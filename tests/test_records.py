@@ -129,7 +129,7 @@ def test_what_lacks_is_told_with_its_command(monkeypatch):
 
     monkeypatch.setitem(TASKS.data, "New-v0", New)
     found = missing("New-v0")
-    assert set(found) == set(COMMANDS) - {"plan"}
+    assert set(found) == set(COMMANDS) - {"plan", "real time"}
     assert found["rollouts"] == "python tests/golden_rollouts.py New-v0"
     assert "New-v0" not in have("returns") and EXAMPLE in have("returns")
     with pytest.raises(ValueError, match="there is no 'films', only returns, rollouts, plan"):

@@ -12,7 +12,9 @@ from mpmath import mp, mpf
 from rollouts import actions, make
 
 from lag_envs import scenes
+from lag_envs.controllers import make_controller
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks.registration import make_task
 
 PI = math.pi
 
@@ -605,3 +607,13 @@ def test_known_returns(env_id, policy, options, known):
     drawn = returns(env_id, policy, **options)
     # The known figures are means of 20 episodes.
     assert abs(drawn.mean() - known) < 3 * drawn.std() / math.sqrt(20) + 0.05 + 0.01 * abs(known)
+
+
+def test_a_tasks_module_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "of_its_own.py").write_text(
+        "import lag_envs\nfrom own_tasks import Drift\n"
+        "class Mine(Drift):\n    'Mine.'\n    id = 'OwnModule-v0'\n\nlag_envs.register(Mine)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert type(make_task("of_its_own:OwnModule-v0")).__name__ == "Mine"
+    assert make_controller("of_its_own:OwnModule-v0", "zero") is not None

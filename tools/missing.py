@@ -95,7 +95,7 @@ def _there(what: str) -> frozenset[str]:
 
 
 def _json(file: Path) -> Any:
-    return json.loads(file.read_text(encoding="utf-8"))
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"envs": {}, "rows": []}
 
 
 def _planned(task: type[Task]) -> bool:

@@ -45,6 +45,7 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of the whole command; only the given subcommand's arguments are declared, if any."""
     whole = argparse.ArgumentParser(
         prog="lag-envs",
+        allow_abbrev=False,
         description="Mechanics as Gymnasium environments, stepped to near machine precision.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -55,6 +56,7 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
         description, _, examples = command.description.partition("\n\nexamples:")
         one = commands.add_parser(
             command.name,
+            allow_abbrev=False,  # a misspelt option shall not act as another
             help=command.help,
             description=description,
             epilog=examples and "examples:" + examples,

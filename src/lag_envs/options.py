@@ -15,6 +15,7 @@ def module_parser(module: str, about: str | None, examples: str, **options: Any)
     """Return the parser of ``python -m MODULE``, whose help keeps the line breaks of its texts."""
     return argparse.ArgumentParser(
         prog=f"python -m {module}",
+        allow_abbrev=False,  # a misspelt option shall not act as another
         description=about,
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar, cast
@@ -118,6 +119,13 @@ class Elsewhere:
         context = multiprocessing.get_context("spawn")
         begin = (_receive, [cloudpickle.dumps(thing)])
         self._pool = ProcessPoolExecutor(1, context, _begin, begin)
+        try:
+            self._pool.submit(int).result()
+        except BrokenProcessPool as error:
+            raise RuntimeError(
+                "no process could be started; a script that starts one has its own commands below "
+                'if __name__ == "__main__":, and is a file'
+            ) from error
 
     def call(self, method: str, *args: Any) -> Future:
         """Call a method of the copy; calls are worked on one after the other."""

@@ -91,8 +91,8 @@ def run_bench(args: argparse.Namespace) -> int:
     if args.checkout is not None:
         if args.threads > 1 or any(getattr(args, o) for o in ("ids", "quick", "cold", "sizes", "keywords")):
             raise UserError(
-                "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes, --with, "
-                "--threads"
+                "--checkout writes a whole measurement into a checkout: leave out IDs, --quick, --cold, "
+                "--sizes, --with, --threads"
             )
         check_checkout("--checkout", args.checkout)
     if args.threads > (cores := usable_cores()):

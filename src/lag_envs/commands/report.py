@@ -11,6 +11,7 @@ from lag_envs.commands.base import OWN, Command, check_checkout, declare_date, n
 from lag_envs.errors import UserError, hint
 from lag_envs.options import count
 from lag_envs.own_files import is_file
+from lag_envs.tasks import TASKS
 
 
 def declare_report(parser: argparse.ArgumentParser) -> None:
@@ -80,6 +81,11 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
     """Return the user's file, empty if there is none, and the report's folder."""
     files = [place for place in places if is_file(place) and not Path(place).is_dir() and ".py" in place]
     folders = [place for place in places if place not in files]
+    if ids := [place for place in folders if place in TASKS]:
+        raise UserError(
+            f"{ids[0]} is an id, and the report measures all environments at once; name a FILE with a scene "
+            "of your own, or the FOLDER to write"
+        )
     if len(files) > 1 or len(folders) > 1:
         raise UserError(f"at most one FILE and one FOLDER, got {' '.join(places)}")
     if files:

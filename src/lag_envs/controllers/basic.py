@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -94,6 +94,7 @@ class Feedback:
 
 def feedback(task: Task, **gains: float) -> Feedback:
     """Return linear feedback for a task with one control; gains are named by the observation's entries."""
+    check_single_control("feedback", task)
     for name in gains:
         if name not in task.observation:
             raise ValueError(f"there is no observation {name!r}, only {', '.join(task.observation)}")
@@ -195,11 +196,13 @@ class FeedbackController(ABC):
     ----------
     task : Task
         The task with its parameters, ``env.unwrapped.task``.
+    complete : bool
+        Whether the observation has to tell the whole state.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, *, complete: bool = False) -> None:
         self.task = task
-        self.read = ObservationDecoder(task)
+        self.read = ObservationDecoder(task, complete=complete)
 
     @abstractmethod
     def control(self, state: Array, target: Array) -> Array:
@@ -231,8 +234,12 @@ def actions_for(task: Task, controls: Array) -> NDArray:
     """
     formulas = task.formulas
     if formulas.choices:
-        (acting,) = formulas.acting
-        return np.abs(controls[..., None] - np.array(acting.values)).argmin(axis=-1)
+        each = [controls] if formulas.actions == 1 else np.moveaxis(controls, -1, 0)
+        nearest = [
+            np.abs(u[..., None] - np.array(a.values)).argmin(axis=-1)
+            for u, a in zip(each, formulas.acting, strict=True)
+        ]
+        return nearest[0] if formulas.actions == 1 else np.stack(nearest, axis=-1)
     if formulas.actions == 1:
         return as_actions(formulas.action(controls), formulas.largest)
     low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
@@ -254,6 +261,12 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
     return scale, -0.5 * scale * (high + low)
 
 
+def check_count(name: str, number: Any, least: int = 1) -> None:
+    """Raise a ValueError for a number that is not whole, or too small."""
+    if not isinstance(number, (int, np.integer)) or number < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {number}")
+
+
 def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:
     """Raise a ValueError for a name that is not among the known ones."""
     for name in given:
@@ -262,9 +275,16 @@ def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:
 
 
 def check_continuous(what: str, task: Task) -> None:
-    """Raise a ValueError for a task whose actions are listed."""
+    """Raise a ValueError for a task without actions, or whose actions are listed."""
+    check_acts(what, task)
     if task.formulas.choices:
         raise ValueError(f"{what} takes continuous actions; {type(task).__name__} has listed actions")
+
+
+def check_acts(what: str, task: Task) -> None:
+    """Raise a ValueError for a task without actions."""
+    if not task.formulas.actions:
+        raise ValueError(f"{what} has nothing to do: {type(task).__name__} has no control to act with")
 
 
 def check_single_control(what: str, task: Task) -> None:
@@ -294,16 +314,24 @@ def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:
 class ObservationDecoder:
     """Reads states and targets from observations.
 
-    A task's observation is linear in the state, in cosine and sine of its angles, and in the target. So it is
-    inverted from its values at zero and at the unit vectors, or shorter ones if an entry is clipped.
+    A task's observation has to be linear in the state, in cosine and sine of its angles (coordinates with the
+    unit rad), and in the target. So it is inverted from its values at zero and at the unit vectors, or
+    shorter ones if an entry is clipped.
 
     Parameters
     ----------
     task : Task
         The task.
+    complete : bool
+        Whether the observation has to tell the whole state.
+
+    Raises
+    ------
+    ValueError
+        For other observations; it names the entries that cannot be read.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, *, complete: bool = False) -> None:
         formulas, form = task.formulas, form_of(task.scene)
         k = SimpleNamespace(**formulas.constants())
         self.task, self._n = task, len(task.scene.state_names)
@@ -321,21 +349,50 @@ class ObservationDecoder:
             return formulas.observe(Lifted(np, known), state, list(row[self._width :][: formulas.targets]), k)
 
         width = self._width + max(formulas.targets, 1)
-        self._zero = np.array(seen(np.zeros(width)))
-
-        def risen(size: float) -> NDArray[np.float64]:
-            return np.array([seen(row) for row in size * np.eye(width)]) - self._zero
-
-        size = 1.0
-        while not np.allclose(risen(size), 2.0 * risen(0.5 * size)):
-            size *= 0.5
-        slopes = risen(size) / size
+        with np.errstate(all="ignore"):
+            slopes, bad = self._linear(seen, width)
+            if bad.any():
+                raise ValueError(self._unreadable("observation", np.array(list(task.observation))[bad]))
         self._slopes, self._angles = slopes, angles
         self._inverse = np.linalg.pinv(slopes)
         #: The angles that are observed only by cosine and sine, and so lie in [-π, π], and their places.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
         self._pairs = [(i, j) for i, j in pairs if slopes[j].any() and slopes[j + 1].any()]
         self.wrapped = [i for i, _ in self._pairs]
+        told = np.abs(slopes @ self._inverse - np.eye(width)).max(axis=1) < 1e-6
+        told[self.wrapped] = [told[[j, j + 1]].all() for _, j in self._pairs]
+        if complete and not told[: self._n].all():
+            raise ValueError(self._unreadable("state", np.array(task.scene.state_names)[~told[: self._n]]))
+
+    def _linear(
+        self, seen: Callable[[NDArray[np.float64]], list], width: int
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the observation's slopes (width, n), and which of its entries are not linear."""
+        self._zero = np.array(seen(np.zeros(width)), np.float64)
+
+        def risen(rows: Array) -> Array:
+            return np.array([seen(row) for row in rows], np.float64) - self._zero
+
+        def differs(one: Array, other: Array) -> NDArray[np.bool_]:
+            near = np.isclose(one, other, rtol=1e-9, atol=1e-11 * np.maximum(1.0, np.abs(self._zero)))
+            return np.asarray(~near.all(axis=0))
+
+        size, axes = 1.0, np.eye(width)
+        while (bad := differs(risen(size * axes), 2.0 * risen(0.5 * size * axes))).any():
+            size *= 0.5
+            if size < 1e-3:  # no entry is clipped so early
+                break
+        slopes = risen(size * axes) / size
+        rows = np.random.default_rng(0).uniform(-size / width, size / width, (4, width))
+        return slopes, bad | differs(risen(rows), rows @ slopes)
+
+    def _unreadable(self, what: str, names: Iterable[str]) -> str:
+        """Return the message for entries that cannot be read."""
+        return (
+            f"this controller reads the state from the observation, but not {', '.join(names)} in the {what} "
+            f"of {type(self.task).__name__}: observe every entry of the state, linearly; of an angle, whose "
+            "unit is rad, cosine and sine are enough"
+        )
 
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
         """Return states (..., n_state) and targets for observations (..., n).

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names
+from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_count, check_names
 from lag_envs.controllers.mpc import without_kicks
 from lag_envs.controllers.swing_up import away
 from lag_envs.envs.model import Model
@@ -111,14 +111,13 @@ class BeamSearch:
             )
         every = horizon if every is None else every
         for name, number in (("horizon", horizon), ("width", width), ("every", every), ("pause", pause)):
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}")
+            check_count(name, number)
         for name, size in (("cell", cell), ("surprise", surprise)):
             if not size > 0.0:
                 raise ValueError(f"{name} must be above 0, got {size}")
         self.task, self.tail, self.horizon, self.width = task, tail, horizon, width
         self.cell, self.every, self.pause, self.surprise = cell, min(every, horizon), pause, surprise
-        self.model, self.read = Model(without_kicks(task)), ObservationDecoder(task)
+        self.model, self.read = Model(without_kicks(task)), ObservationDecoder(task, complete=True)
         each = np.indices(task.formulas.choices).reshape(task.formulas.actions, -1).T
         self.actions = each[:, 0] if task.formulas.actions == 1 else each
         self._aims = task.target_range is not None

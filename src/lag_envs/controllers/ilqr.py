@@ -90,7 +90,7 @@ class ILQR:
         self.iterations, self.tolerance, self.gains = iterations, tolerance, gains
         self.flat = FLAT * task.dt / task.interval
         self.largest, self.count = task.formulas.largest, task.formulas.actions
-        self.model, self.read = Model(task), ObservationDecoder(task)
+        self.model, self.read = Model(task), ObservationDecoder(task, complete=True)
         self._k = SimpleNamespace(**task.formulas.constants())
 
     def predict(
@@ -101,6 +101,8 @@ class ILQR:
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Plan]:
         """Return the action for each observation; the state holds the plans."""
+        if not self.guesses:
+            raise ValueError("iLQR needs `guesses`, controllers whose actions it improves")
         values = np.asarray(observation)
         x, target = (v.reshape(-1, *v.shape[values.ndim - 1 :]) for v in self.read(values))
         n = len(x)

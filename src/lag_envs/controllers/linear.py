@@ -17,6 +17,7 @@ from scipy.linalg import solve_discrete_are
 from lag_envs.controllers.basic import (
     FeedbackController,
     FeedbackLaw,
+    check_acts,
     check_continuous,
     check_names,
     check_single_control,
@@ -169,10 +170,16 @@ class Regulator(FeedbackController):
         effort: float,
         at: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(task)
+        check_acts("Regulator", task)
+        super().__init__(task, complete=True)
         scene, at = task.scene, at or {}
         check_names("at", at, scene.state_names)
         check_names("weights", weights, scene.state_names)
+        for name, weight in weights.items():
+            if not 0.0 <= weight < np.inf:
+                raise ValueError(f"weights: that of {name} must be finite and at least 0, got {weight}")
+        if not 0.0 < effort < np.inf:
+            raise ValueError(f"effort must be finite and above 0, got {effort}")
         self.rest = np.array([at.get(name, 0.0) for name in scene.state_names])
         self._check_rest(task)
         columns = [scene.control_names.index(a.control) for a in task.formulas.acting]
@@ -209,7 +216,9 @@ class Regulator(FeedbackController):
         return u[..., 0] if self.gain.shape[0] == 1 else u
 
     def law(self, task: Task) -> FeedbackLaw | None:
-        """Return the controller as feedback; None for a subclass that does more."""
+        """Return the controller as feedback; None where it is not: with several lists of actions."""
+        if task.formulas.choices and task.formulas.actions > 1:
+            return None
         return hold_law(task, self.rest, self.gain, self.read)
 
 

@@ -10,11 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_names, remade
+from lag_envs.controllers.basic import (
+    Array,
+    ObservationDecoder,
+    beginning,
+    check_continuous,
+    check_count,
+    check_names,
+    remade,
+)
 from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
 from lag_envs.controllers.linear import regulator, time_varying
 from lag_envs.controllers.swing_up import away
-from lag_envs.controllers.tracking import Tracking, hold, recorded, smoothed, waves
+from lag_envs.controllers.tracking import Tracking, hold, plans_of, recorded, smoothed, waves
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Plans
 from lag_envs.workers import Elsewhere
@@ -129,16 +137,15 @@ class MPC:
             ("finer", finer),
             ("budget", budget),
         ):
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}")
-        if ahead < 0:
-            raise ValueError(f"ahead must be at least 0, got {ahead}")
+            check_count(name, number)
+        check_count("ahead", ahead, 0)
         if background and not ahead:
             raise ValueError("background=True needs `ahead`, the number of steps that a renewal may take")
+        check_continuous("MPC", task)
         if not 0.0 <= reserve < 1.0:
             raise ValueError(f"reserve must be at least 0 and less than 1, got {reserve}")
-        if first and task.plans is None:
-            raise ValueError(f"first: {type(task).__name__} has no `plans`, which specify the feedback")
+        if first:
+            plans_of(task)
         for guess in first:
             if guess.task.scene != task.scene or type(guess.task) is not type(task):
                 raise ValueError(
@@ -154,7 +161,7 @@ class MPC:
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
         self.largest, self.count = task.formulas.largest, task.formulas.actions
-        self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
+        self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task, complete=True)
         calm = without_kicks(task)
         gains = None if not first else self._gains
         self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations, gains=gains)
@@ -391,8 +398,9 @@ def planner(
 
 def loss(task: Task) -> Callable[[Array], Array]:
     """Return the best regulator's loss of reward from states near upright; farther off, a larger one."""
-    read, rest = ObservationDecoder(task), np.array(task.plans.rest)
-    _, cost = regulator(smoothed(task), rest, extra=task.plans.extra)
+    plans = plans_of(task)
+    read, rest = ObservationDecoder(task), np.array(plans.rest)
+    _, cost = regulator(smoothed(task), rest, extra=plans.extra)
 
     def lost(states: Array) -> Array:
         off = read.difference(states, rest)
@@ -428,7 +436,7 @@ def renewed(
     **numbers
         Other arguments of `MPC`, and of `held`.
     """
-    plans = task.plans if effort is None else dataclasses.replace(task.plans, effort=effort)
+    plans = plans_of(task) if effort is None else dataclasses.replace(plans_of(task), effort=effort)
     laws = [recorded(task, kind) for kind in (["followed", "quick"] if plans.quick else ["followed"])]
     first = [*laws, *(law.mirrored() for law in laws)]
     if finer > 1:

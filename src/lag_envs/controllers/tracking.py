@@ -134,9 +134,18 @@ class Tracking(Clocked):
         )
 
 
+def plans_of(task: Task) -> Plans:
+    """Return `Task.plans`, or raise a ValueError."""
+    if task.plans is None:
+        raise ValueError(
+            f"{type(task).__name__} has no `plans`, which say how its plans are made and followed"
+        )
+    return task.plans
+
+
 def plan_file(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
     """Return the place of a task's plan: the one to follow, or the "quick" one as an initial guess."""
-    return (folder or FOLDER) / f"{task.plans.of or task.id}-{kind}.npz"
+    return (folder or FOLDER) / f"{plans_of(task).of or task.id}-{kind}.npz"
 
 
 def recorded(task: Task, kind: str = "followed") -> Tracking:
@@ -146,7 +155,7 @@ def recorded(task: Task, kind: str = "followed") -> Tracking:
 
 def hold(task: Task, plans: Plans | None = None) -> Tracking:
     """Return the regulator that holds the end of plans, as `Task.plans` specifies, or others."""
-    plans = plans or task.plans
+    plans = plans or plans_of(task)
     return follow(task, [plans.rest], np.empty(0), plans)
 
 

@@ -309,6 +309,11 @@ def _some(board: Board) -> BoardState:
     if not state.entries:
         if parse(read_log(board.log))[1]:
             raise BoardError(f"{board.log} has only a torn line; {REMEDY}")
+        if not board.folder.is_dir():
+            raise BoardError(
+                f"there is no board in {board.folder}; --board names the folder of one, and "
+                "`lag-envs leaderboard add FOLDER` begins one in leaderboard"
+            )
         raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
     return state
 
@@ -439,7 +444,9 @@ def _serve(args: argparse.Namespace) -> int:
         write_page(page_data(Board(args.board)), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
-        except (OSError, OverflowError) as error:
+        except OverflowError as error:
+            raise BoardError(f"--port must be a number from 0 to 65535, got {args.port}") from error
+        except OSError as error:
             raise BoardError(
                 f"port {args.port} is already in use ({error}); --port 0 takes a free one"
             ) from error

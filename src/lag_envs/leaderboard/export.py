@@ -126,7 +126,12 @@ def algorithm_of(source: Source) -> str:
 
 def _name(source: Source, algo: str | None) -> str:
     """Return what a model's learner is called."""
-    return "PPO" if arrays_of(source.model) else ALGORITHMS[algo or algorithm_of(source)][1]
+    if arrays_of(source.model) is None:
+        return ALGORITHMS[algo or algorithm_of(source)][1]
+    if algo:
+        raise ExportError(f"{source.model} holds a network, not a model; leave --algo out")
+    words = (source.result or {}).get("algo", "ppo").split("_")
+    return " ".join(word.upper() if word in ("ppo", "shac") else word for word in words)
 
 
 #: Keyword for the `load` of Stable-Baselines3's learners: each chooses the buffer by the model's `n_steps`.
@@ -532,9 +537,10 @@ def run_export(args: argparse.Namespace) -> int:
         raise UserError(f'{error.name} is missing: pip install "lag-envs[agents,leaderboard]"') from error
     except ExportError as error:
         raise UserError(str(error)) from error
+    alike = f"largest difference of an action from the models': {off:.1e}, over {count} observations of each"
     print(
         f"{submission.folder}: {submission.env}, {submission.name}, {len(submission.policies)} policies\n"
-        f"largest difference of an action from the models': {off:.1e}, over {count} observations of each\n"
+        f"{alike if count else 'their numbers are taken over as they are'}\n"
         f"digest {submission.digest}"
     )
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -56,7 +57,13 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
 
 
 def make_task(env_id: str, **options: Any) -> Any:
-    """Return the task of a registered environment, with some of its parameters changed."""
+    """Return the task of a registered environment, with some of its parameters changed.
+
+    As with `gym.make`, "module:Id-v0" imports the module first.
+    """
+    if ":" in env_id:
+        module, _, env_id = env_id.partition(":")
+        import_module(module)
     keywords = gym.spec(env_id).kwargs | options
     return load_task(keywords.pop("task"))(**keywords)
 
