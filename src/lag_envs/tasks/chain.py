@@ -184,7 +184,7 @@ class SwingUp(GuardedTrack, _ChainTask):
     note = """
 The best known method plans anew for each start. MPC is nearly as good and needs no time before it: it begins
 with a recorded plan, and improves it on the way up. One recorded plan with time-varying feedback comes close,
-because all starts are close together. TD3 learns from fewer steps than the PPO in one file, and less.
+because all starts are close together. SAC and TD3 learn from fewer steps than the PPO in one file, and less.
 """
 
     steps_of_plan, batch, iterations, price, strength = 65, 32, 120, 0.05, 0.95
