@@ -1,6 +1,7 @@
 """Scenes and tasks outside the package: written by name, with everything that the package's own have."""
 
 import copy
+import inspect
 import math
 import pickle
 import warnings
@@ -17,9 +18,12 @@ from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
 
 import lag_envs
+from lag_envs.envs.single import LagrangianEnv
+from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.scenes import Scene, StepRefused
+from lag_envs.scenes import CartPole, Scene, StepRefused, parameter
 from lag_envs.tasks import Task, pivoted_bar
+from lag_envs.tasks.imperfections import KEYWORDS
 
 IDS = [task.id for task in own_tasks.TASKS]
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -406,6 +410,21 @@ def test_velocities_of_a_task_are_in_the_order_of_energies():
 def test_a_task_without_a_scene():
     with pytest.raises(FormulaError, match=r"Sceneless\.scene must be a class derived from Scene, got None"):
         type("Sceneless", (Task,), {"action": {"push": 1.0}})()
+
+
+def _keywords(*calls):
+    every = [p for call in calls for p in inspect.signature(call).parameters.values()]
+    return {p.name for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD}
+
+
+def test_a_field_of_a_scene_is_no_keyword_of_environments():
+    names = _keywords(LagrangianEnv, LagrangianVectorEnv, gym.make, gym.make_vec, Task)
+    for name in sorted(names | {*KEYWORDS}):
+        fields = {"__annotations__": {name: "float"}, name: parameter(2.0, "N/m", above=0.0)}
+        scene = type("Motor", (CartPole,), {"__module__": __name__, **fields})
+        assert getattr(scene(), name) == 2.0  # a scene that is only simulated may have it
+        with pytest.raises(FormulaError, match=f"Mistaken.scene: the field '{name}' of Motor .* rename the"):
+            _mistaken(scene=scene)()
 
 
 def test_a_kick_states_how_many_numbers_it_draws():
