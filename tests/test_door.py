@@ -537,7 +537,7 @@ def computed_default_that_fails():
     return Bad
 
 
-@mistake("Bad.spring fails with AttributeError", "no attribute 'mas'; did you mean mass?")
+@mistake("Bad.spring fails with AttributeError", "no attribute 'mas'; did you mean mass")
 def computed_default_of_an_unknown_name():
     class Bad(Good):
         spring: float = parameter(lambda scene: 2.0 * scene.mas, "N/m")
