@@ -63,7 +63,8 @@ class Task:
     steps : int
         Steps of an episode.
     action : mapping
-        For each control that actions set: its limit, (low, high), or a list of values to choose from.
+        For each control that actions set: its limit, (low, high), or a list, array or range of values to
+        choose from.
     start : mapping
         For entries of the state: a half width around 0, or (centre, half width). The others start at 0.
     target : mapping
