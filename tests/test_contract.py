@@ -495,6 +495,7 @@ def test_scene_of_sympys_expressions(functions_of_time):
 def test_scene_of_sympys_expressions_has_all_functions():
     q, q_dot, k = sympy.symbols("q q_dot k")
     potential = sum(f(q / 3) for f in (sympy.sin, sympy.cos, sympy.tan, sympy.atan, sympy.tanh, sympy.exp))
+    potential += (2 + q) ** 2.5 + (2 + q) ** -1.5 + (2 + q) ** 3.0  # floats that are halves
     potential += sympy.log(3 + q) + sympy.sqrt(3 + q) + 1 / sympy.sqrt(5 + q) + (4 + q) ** -2 + sympy.pi * q
     scene = Scene.from_sympy(
         "All", q_dot**2 * (k + sympy.Rational(1, 3)) / 2, potential, coordinates={q: "m"}, parameters={k: 1.0}
@@ -511,7 +512,7 @@ def test_scene_of_sympys_expressions_has_all_functions():
         ("Abs(q)", "Abs"),
         ("sinh(q)", "sinh"),
         ("q * t", "time"),
-        ("q ** 1.5", "power"),
+        ("q ** 1.2", r"q\*\*1\.2 has the power 1\.2"),
         ("q_dot ** 2", "q_dot is neither"),
         ("I * q", "not one of|neither|real"),
         ("Piecewise((q, q > 0), (0, True))", "Piecewise"),

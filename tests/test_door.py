@@ -518,6 +518,38 @@ def structural_field_that_is_a_list():
     return lambda: Bad(lengths=[1.0, 2.0])
 
 
+@mistake("Bad.coordinates fails with TypeError: 'str' object cannot be", "; it was given links='4'")
+def structural_field_of_another_type():
+    bad = changed(coordinates=property(lambda self: {f"x_{i}": "m" for i in range(self.links)}))
+    return lambda: bad(links="4")
+
+
+@mistake("Bad.bodies fails with IndexError", "it was given mass=1.0, spring=2.0, friction=0.0, links=2")
+def bodies_that_fail():
+    return changed(bodies=lambda self: {"ground": [][self.links]})
+
+
+@mistake("Bad.spring fails with ZeroDivisionError", "it was given mass=1.0, friction=0.0, links=2")
+def computed_default_that_fails():
+    class Bad(Good):
+        spring: float = parameter(lambda scene: 1.0 / scene.friction, "N/m")
+
+    return Bad
+
+
+@mistake("Bad.spring fails with AttributeError", "no attribute 'mas'; did you mean mass")
+def computed_default_of_an_unknown_name():
+    class Bad(Good):
+        spring: float = parameter(lambda scene: 2.0 * scene.mas, "N/m")
+
+    return Bad
+
+
+@mistake("Bad.kinetic", "'Values' and 'int'; take the numbers one by one, by name or index")
+def arithmetic_with_all_velocities():
+    return changed(kinetic=lambda self, q, v, xp: self.mass * v**2)
+
+
 # --- the test ----------------------------------------------------------------------------------------------
 
 for name, (attributes, words) in (UNTRACEABLE | INVALID | DECLARED).items():

@@ -1,6 +1,7 @@
 """Scenes and tasks outside the package: written by name, with everything that the package's own have."""
 
 import copy
+import inspect
 import math
 import pickle
 import warnings
@@ -17,9 +18,12 @@ from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
 
 import lag_envs
+from lag_envs.envs.single import LagrangianEnv
+from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.scenes import Scene, StepRefused
+from lag_envs.scenes import CartPole, Scene, StepRefused, parameter
 from lag_envs.tasks import Task, pivoted_bar
+from lag_envs.tasks.imperfections import KEYWORDS
 
 IDS = [task.id for task in own_tasks.TASKS]
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -175,6 +179,13 @@ def test_discrete_actions():
             env.step(wrong)
 
 
+@pytest.mark.parametrize("values", [np.array([-1.0, 0.0, 2.0]), range(-1, 3)])
+def test_listed_actions_may_be_an_array_or_a_range(values):
+    task = _mistaken(action={"push": values, "pull": [0.0, 1.0]})()
+    assert task.formulas.acting[0].values == tuple(map(float, values))
+    assert task.formulas.choices == (len(values), 2)
+
+
 @pytest.mark.parametrize("action", [[0.1], [0.1, 0.2, 0.3], [0.1, np.nan], ["a", "b"], None, [[0.1, 0.2]]])
 def test_bad_actions(action):
     env = gym.make("OwnCrane-v0").unwrapped
@@ -303,6 +314,7 @@ def _mistaken(**changes):
         ({"action": {"push": "far", "pull": 1.0}}, r"^Mistaken.action\['push'\] must be a real number"),
         ({"action": {"push": [1.0, 2.0], "pull": 1.0}}, "mixes lists of values with ranges"),
         ({"action": {"push": [1.0]}}, "at least two values"),
+        ({"action": {"push": np.ones((2, 2))}}, r"action\['push'\] must be a real number, got array"),
         ({"start": {"y": 0.1}}, r"start\['y'\]: the state has no such entry, only x, x_dot"),
         ({"start": {"x": "far"}}, r"^Mistaken.start\['x'\] must be a real number, got 'far'"),
         ({"target": {"x_goal": 0.3}}, r"target\['x_goal'\] must be \(unit, half width\)"),
@@ -332,6 +344,12 @@ def _mistaken(**changes):
         ({"bounds": lambda self: {"height": 1.0}}, "there is no observation 'height'"),
         ({"bounds": lambda self: {"x": "far"}}, r"bounds\['x'\] must be a bound above 0 or \(low, high\)"),
         ({"bounds": lambda self: {"x": (2.0, 1.0)}}, r"bounds\['x'\] must be .* got \(2.0, 1.0\)"),
+        ({"bounds": lambda self: {"x": ("a", "b")}}, r"bounds\['x'\] must be .* got \('a', 'b'\)"),
+        ({"bounds": lambda self: {"x": math.nan}}, r"^Mistaken.bounds\['x'\] must be .* got nan"),
+        ({"bounds": lambda self: {"x": (math.nan, 1.0)}}, r"bounds\['x'\] must be .* got \(nan, 1.0\)"),
+        ({"bounds": lambda self: {"x": np.ones(2)}}, r"bounds\['x'\] must be .* got array"),
+        ({"bounds": lambda self: None}, "^Mistaken.bounds returns None; it must return bounds by name"),
+        ({"bounds": lambda self: [1.0, 2.0]}, "bounds returns a list; it must return bounds by name"),
         ({"start": {"x": (0.0, -0.5)}}, r"start\['x'\]: a half width must not be negative"),
         ({"target": {"x_goal": ("m", -1.0)}}, r"target\['x_goal'\]: a half width must not be negative"),
         ({"defaults": {"load_mas": 1.0}}, "Mistaken.defaults: .*'load_mas'; did you mean load_mass?"),
@@ -351,10 +369,30 @@ def _mistaken(**changes):
         ({"kick": Task.kick}, "Mistaken.draws is 2, but there is no kick"),
         ({"kick": lambda self, after, draws, xp: None}, "kick returns None; it must return changes"),
         ({"guard": lambda self, *_: {"pull": None}}, "guard returns None; it must return numbers"),
+        ({"guard": lambda self, *_: {"pull": math.nan}}, r"Mistaken.guard\['pull'\] must be finite, got nan"),
+        (
+            {"guard": lambda self, wanted, before, *_: before},
+            "guard must return controls by name, got <entry",
+        ),
         (
             {"observe": lambda self, after, target, xp: {"x": "y1"}},
             "observe returns 'y1'; it must return num",
         ),
+        (
+            {"observe": lambda self, after, *_: {"x": after.x, "top": math.inf}, "bounds": Task.bounds},
+            r"^Mistaken.observe\['top'\] must be finite, got inf",
+        ),
+        ({"observe": lambda *_: {"x": 10**400}}, r"Mistaken.observe\['x'\] must be finite, got 1000"),
+        (
+            {"reward": lambda self, b, after, control, *_: control},
+            "reward returns <controls push, pull>; it must return a number; .* as in control.NAME",
+        ),
+        (
+            {"last_reward": lambda self, b, after, *_: after},
+            "last_reward returns <entry of the states x, x_dot",
+        ),
+        ({"reward": lambda self, b, after, control, *_: -(control**2)}, "take the numbers one by one"),
+        ({"kick": lambda self, after, draws, xp: {"x": draws}}, "kick returns <random draws 0, 1>; it must"),
         (
             {"reward": lambda self, b, after, *_: np.array([after.x])},
             "reward returns an array; it must return a number",
@@ -408,6 +446,21 @@ def test_a_task_without_a_scene():
         type("Sceneless", (Task,), {"action": {"push": 1.0}})()
 
 
+def _keywords(*calls):
+    every = [p for call in calls for p in inspect.signature(call).parameters.values()]
+    return {p.name for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD}
+
+
+def test_a_field_of_a_scene_is_no_keyword_of_environments():
+    names = _keywords(LagrangianEnv, LagrangianVectorEnv, gym.make, gym.make_vec, Task)
+    for name in sorted(names | {*KEYWORDS}):
+        fields = {"__annotations__": {name: "float"}, name: parameter(2.0, "N/m", above=0.0)}
+        scene = type("Motor", (CartPole,), {"__module__": __name__, **fields})
+        assert getattr(scene(), name) == 2.0  # a scene that is only simulated may have it
+        with pytest.raises(FormulaError, match=f"Mistaken.scene: the field '{name}' of Motor .* rename the"):
+            _mistaken(scene=scene)()
+
+
 def test_a_kick_states_how_many_numbers_it_draws():
     class Silent(pivoted_bar.SwingUp):
         id = "OwnSilent-v0"
@@ -451,6 +504,14 @@ def test_comparisons_count_as_one_and_zero():
             env.reset(seed=seed)
             reward = env.step(env.action_space.sample())[1]
             assert reward == expected[bool(env.unwrapped.state[0] > 0.0)]
+
+
+@pytest.mark.parametrize(("id", "scaled"), [("OwnEndless-v0", True), ("OwnEndless-v1", False)])
+def test_a_reward_may_be_infinite(id, scaled):
+    kind = _mistaken(reward=lambda *_: -math.inf, scaled=scaled)
+    env = gym.make(lag_envs.register(kind, id=id), disable_env_checker=True)
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[1] == -math.inf
 
 
 def test_changed_numbers_are_used():

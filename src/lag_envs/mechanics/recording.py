@@ -164,8 +164,18 @@ class Record:
 
 
 @contextlib.contextmanager
-def formula(scene: Any, name: str) -> Iterator[None]:
-    """Add class and formula to the message of errors raised within."""
+def formula(scene: Any, name: str, fields: Sequence[str] | None = None) -> Iterator[None]:
+    """Add class and formula to the message of errors raised within.
+
+    Parameters
+    ----------
+    scene : Scene or Task
+        Whose formula it is.
+    name : str
+        The formula, or a property or parameter that is computed.
+    fields : sequence of str, optional
+        The fields that it may use, for one that is not run on recorded numbers.
+    """
     where = f"{type(scene).__name__}.{name}"
     try:
         yield
@@ -174,18 +184,23 @@ def formula(scene: Any, name: str) -> Iterator[None]:
     except dataclasses.FrozenInstanceError as error:
         raise FormulaError(f"{where} assigns to self: {error}; use a local name") from error
     except Exception as error:
+        on = " on recorded numbers" if fields is None else ""
         raise FormulaError(
-            f"{where} fails on recorded numbers with {type(error).__name__}: {error}; {_remedy(scene, error)}"
+            f"{where} fails{on} with {type(error).__name__}: {error}; {_remedy(scene, error, fields)}"
         ) from error
 
 
-def _remedy(of: Any, error: Exception) -> str:
-    """Return what to do about an error in a formula of a scene or task."""
+def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
+    """Return what to do about an error in a formula of a scene or task, or what it was computed from."""
     if of_numpy := re.search(r"no callable (\w+) method", str(error)):  # np.exp of a recorded number
         return f"write xp.{of_numpy[1]}, and functions of xp only"
     owner = getattr(error, "obj", None)
     ours = owner is not None and type(owner) in (type(of), type(getattr(of, "scene", None)))
     if not isinstance(error, AttributeError) or not ours:
+        if used is not None:
+            return f"it was given {', '.join(f'{f}={getattr(of, f)!r:.40}' for f in used) or 'no fields'}"
+        if "'Values'" in str(error):  # arithmetic with all of them
+            return "take the numbers one by one, by name or index"
         return "use + - * /, whole powers and functions of xp"
     fields = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
     otherwise = f"it has {', '.join(fields)}" if fields else "define it in the class"

@@ -27,8 +27,9 @@ def layout_of(scene: Scene) -> SceneLayout:
     if found is None:
         # Properties may branch on structural fields and use them as counts, but not parameters.
         copy, declared = recording.symbolic_twin(scene), {}
+        structural = [f.name for f in dataclasses.fields(scene) if "unit" not in f.metadata]  # type: ignore[arg-type]
         for name in (*MAPPINGS, *SEQUENCES):
-            with recording.formula(scene, name):
+            with recording.formula(scene, name, structural):
                 declared[name] = getattr(copy, name)
         controls, absent = controls_of(scene, declared.pop("modes"), declared.pop("controls"))
         found = make_layout(type(scene).__name__, controls=controls, absent=absent, **declared)

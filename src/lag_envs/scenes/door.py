@@ -127,7 +127,7 @@ def _check_names(scene: Any, base: type) -> None:
 def _check_bodies(scene: Any) -> None:
     """Raise a FormulaError if a body has no pose, or a force no equation."""
     of, found = type(scene).__name__, scene.mechanics
-    with recording.formula(scene, "bodies"):
+    with recording.formula(scene, "bodies", [field.name for field in dataclasses.fields(scene)]):
         bodies = scene.bodies()
     if not isinstance(bodies, Mapping):
         raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")

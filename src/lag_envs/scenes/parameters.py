@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import formula
 from lag_envs.scenes.checks import SMALLEST, check_number
 
 
@@ -76,7 +77,9 @@ def fill_in(scene: Any) -> None:
     for field in (*(f for f in fields.values() if f not in made), *made):
         value = getattr(scene, field.name)
         if field in made:
-            value = field.metadata["made"](scene)
+            others = [f.name for f in dataclasses.fields(scene) if f is not field]
+            with formula(scene, field.name, others):
+                value = field.metadata["made"](scene)
             value = None if value is None else _check_made(field, value)
         elif value is not None or not field.metadata["optional"]:
             value = _check_range(field, value)

@@ -269,13 +269,15 @@ def evaluate_expression(expression: Any, values: Mapping[Any, Any], xp: Any) -> 
         return first
     if expression.is_Pow:
         base, exponent = expression.args
+        if exponent.is_Float:  # exactly: 2.5 is a half
+            exponent = sympy.Rational(exponent)
         if exponent.is_Integer:
             return of(base) ** int(exponent) if exponent > 0 else 1 / of(base) ** -int(exponent)
         if exponent.is_Rational and exponent.q == 2:
             root = xp.sqrt(of(base)) ** abs(int(exponent.p))
             return root if exponent > 0 else 1 / root
         raise FormulaError(
-            f"{expression} has the power {exponent}; only whole numbers and halves can be powers"
+            f"{expression} has the power {expression.exp}; only whole numbers and halves can be powers"
         )
     if expression.func in _FUNCTIONS:
         return getattr(xp, _FUNCTIONS[expression.func])(of(expression.args[0]))

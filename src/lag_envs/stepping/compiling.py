@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
@@ -97,7 +98,9 @@ def compile_function(
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
     unique = f"{name}_{digest}"
     code = compile(source.replace(f"def {name}(", f"def {unique}(", 1), f"<{unique}>", "exec")
-    namespace: dict[str, Any] = dict(primitives.NAMES, **constants, __name__=__name__)
+    # A result may have turned out to be an infinite constant, or NaN.
+    words = {"inf": math.inf, "nan": math.nan}
+    namespace: dict[str, Any] = dict(primitives.NAMES, **words, **constants, __name__=__name__)
     namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}
     namespace |= {block: primitives.block(*_blocks[block]) for block in re.findall(_BLOCK, source)}
     exec(code, namespace)

@@ -7,10 +7,11 @@ import dataclasses
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -35,6 +36,8 @@ FASTEST_START = 100.0
 LONGEST_TURN = 5000.0
 #: Keywords that environments take besides those of their task.
 OF_ENVIRONMENTS = ("render_mode", "diagnostics", "show_arrows", "show_trail", "show_readout")
+#: Keywords that vector environments take besides those.
+OF_BATCHES = ("num_envs", "max_episode_steps", "autoreset_mode", "num_threads", "show_tiles")
 
 
 class Task:
@@ -60,7 +63,8 @@ class Task:
     steps : int
         Steps of an episode.
     action : mapping
-        For each control that actions set: its limit, (low, high), or a list of values to choose from.
+        For each control that actions set: its limit, (low, high), or a list, array or range of values to
+        choose from.
     start : mapping
         For entries of the state: a half width around 0, or (centre, half width). The others start at 0.
     target : mapping
@@ -178,6 +182,12 @@ class Task:
             )
         asked = {name: parameters.pop(name) for name in KEYWORDS if name in parameters}
         known = list(inspect.signature(kind).parameters)
+        for name in known:
+            if name in _reserved():
+                raise FormulaError(
+                    f"{type(self).__name__}.scene: the field {name!r} of {kind.__name__} has the name of a "
+                    "keyword of environments, so it could not be set; rename the field"
+                )
         for mapping in ("defaults", "usable"):
             for name in sorted(set(getattr(self, mapping)) - set(known)):
                 raise FormulaError(
@@ -193,7 +203,7 @@ class Task:
         for name in sorted(set(parameters) - set(known)):
             target = ["target"] if type(self).target else []
             options = [*sorted(known), "dt", "duration", *target, *KEYWORDS, *OF_ENVIRONMENTS]
-            meant = "gym.make_vec makes many;" if name == "num_envs" else hint(name, options, " ").strip()
+            meant = "gym.make_vec makes many;" if name in OF_BATCHES else hint(name, options, " ").strip()
             # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; {meant}{' ' if meant else ''}this environment "
@@ -532,3 +542,12 @@ class Task:
             Reading(t.name, float(value), t.unit, "target")
             for t, value in zip(self.formulas.target_boxes, given, strict=False)
         ]
+
+
+@cache
+def _reserved() -> frozenset[str]:
+    """Return the keywords of environments, and of what makes them, that no field of a scene may have."""
+    calls = (Task.__init__, gym.make, gym.make_vec)
+    every = [p for call in calls for p in inspect.signature(call).parameters.values()]
+    named = [p.name for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]
+    return frozenset((*named, "task", *KEYWORDS, *OF_ENVIRONMENTS, *OF_BATCHES))

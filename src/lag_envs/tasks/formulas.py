@@ -302,8 +302,8 @@ class TaskFormulas:
             return list(wanted.values())
         given = Values("control", wanted)
         found = self._call("guard", k, given, self.named_state(y), k.dt, self._known(xp, y))
-        if isinstance(found, Values):
-            return list(found)
+        if found is given:
+            return list(given)
         if not isinstance(found, Mapping):
             if len(self.acting) != 1:
                 raise FormulaError(
@@ -336,7 +336,7 @@ class TaskFormulas:
         before, after = self.named_state(y), self.named_state(z)
         value = self._call(name, k, before, after, self._applied(u), self.named_targets(g), k.dt, xp)
         array = isinstance(value, np.ndarray) and isinstance(k.scale, TracedNumber)
-        if value is None or array or isinstance(value, Mapping | Sequence):
+        if value is None or array or isinstance(value, Mapping | Sequence | Values):
             self._refuse(name, value, "a number")
         return k.scale * value if self._task.scaled else _counted(value)
 
@@ -348,6 +348,8 @@ class TaskFormulas:
             self._refuse("kick", added, "changes of the state's entries by name")
         after = dict(zip(self.state, z, strict=False))
         for name, value in added.items():
+            if isinstance(value, Values):
+                self._refuse("kick", value, "numbers")
             if name not in after:
                 raise FormulaError(
                     f"{type(self._task).__name__}.kick: there is no entry {name!r} of the state, "
@@ -400,13 +402,19 @@ class TaskFormulas:
             for value in values:
                 if not isinstance(value, TracedNumber | numbers.Real | np.bool_):
                     self._refuse(name, value, "a number" if "reward" in name else "numbers")
-        code = trace.operations([ended, *itertools.chain(*found.values())])
         names = tuple(self._call("observe", k, self.named_state(y), self.named_targets(g), trace))
+        for name, entries in (("guard", self._controls), ("observe", names)):
+            for entry, value in zip(entries, found[name], strict=True):
+                if isinstance(value, numbers.Real):  # the same in every step
+                    _numbers_of(f"{type(self._task).__name__}.{name}[{entry!r}]", [value])
+        code = trace.operations([ended, *itertools.chain(*found.values())])
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
 
     def _refuse(self, name: str, found: Any, wanted: str) -> NoReturn:
         kinds = {TracedNumber: "a number", np.ndarray: "an array", list: "a list", tuple: "a tuple"}
         got = kinds.get(type(found)) or f"{found!r:.60}"
+        if isinstance(found, Values):
+            wanted += "; take an entry by its name, as in control.NAME or after.NAME"
         raise FormulaError(f"{type(self._task).__name__}.{name} returns {got}; it must return {wanted}")
 
     def sample_targets(self, draws: Sequence, k: Any) -> list:
@@ -444,7 +452,9 @@ class TaskFormulas:
 
     def box(self) -> tuple[list[float], list[float]]:
         """Return the lowest and highest values of the observation's entries."""
-        given = dict(self._task.bounds())
+        given = self._task.bounds()
+        if not isinstance(given, Mapping):
+            self._refuse("bounds", given, "bounds by name, or {} if none is known")
         for name in given:
             if name not in self.observation:
                 raise FormulaError(
@@ -452,19 +462,20 @@ class TaskFormulas:
                     f"only {', '.join(self.observation)}"
                 )
         low, high, unbounded = [], [], self._task.unbounded
+        # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
+        endless = math.isinf(self._task.duration)
         for name in self.observation:
             bound = given.get(name, unbounded)
             where = f"{type(self._task).__name__}.bounds[{name!r}]"
             try:
-                pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
-                wrong = len(pair) != 2 or pair[0] > pair[1]
-            except TypeError:
+                bottom, top = map(float, bound if isinstance(bound, tuple | list) else (-bound, bound))
+                wrong = bottom > top if endless else not bottom <= top
+            except (TypeError, ValueError):  # other than two numbers
                 wrong = True
             if wrong:
                 raise FormulaError(f"{where} must be a bound above 0 or (low, high), got {bound!r:.60}")
-            # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
-            low.append(float(pair[0]) if pair[0] > -UNBOUNDED else -unbounded)
-            high.append(float(pair[1]) if pair[1] < UNBOUNDED else unbounded)
+            low.append(bottom if bottom > -UNBOUNDED else -unbounded)
+            high.append(top if top < UNBOUNDED else unbounded)
         return low, high
 
 
@@ -538,7 +549,7 @@ def _acting(task: Task) -> list[Acting]:
         where = f"{of}.action[{name!r}]"
         if name not in known:
             raise FormulaError(f"{where}: the scene has no such control, only {', '.join(known) or 'none'}")
-        if isinstance(given, list):
+        if isinstance(given, list | range) or (isinstance(given, np.ndarray) and given.ndim):
             values = _numbers_of(where, given)
             if len(values) < 2:
                 raise FormulaError(f"{where} must list at least two values, got {given!r}")
