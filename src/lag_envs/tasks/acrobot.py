@@ -293,7 +293,7 @@ class AcrobotReal(Task):
             "lag_envs.controllers.mpc:renewed",
             {"finer": 5, "every": 5, "iterations": 3, "surprise": math.inf, "reserve": 0.05},
             plans=True,
-            real_time={"ahead": 8, "every": 1},
+            real_time={"ahead": 12, "every": 1},
         ),
     }
     plans = Plans(

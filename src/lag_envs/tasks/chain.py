@@ -305,7 +305,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
             "lag_envs.controllers.mpc:renewed",
             {"beyond": 1.0, "every": 2, "near": 0.05},
             plans=True,
-            real_time={"ahead": 4, "every": 1},
+            real_time={"ahead": 6, "every": 1},
         ),
     }
 
