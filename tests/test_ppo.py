@@ -164,8 +164,10 @@ def test_the_policy_that_was_written_is_the_one_that_was_evaluated(frames, tmp_p
         watch.load_agent(ENV, TASKS[ENV](), str(tmp_path))[1],
     ):
         assert play(ENV, policy, fresh_seeds(20)).tolist() == result["evaluation"]["returns"]
-    with pytest.raises(UserError, match="act in the package's environments alone"):
+    with pytest.raises(UserError, match=f"is an agent of {ENV}, not of OwnCentre-v0"):
         watch.load_agent("OwnCentre-v0", Centre(), str(tmp_path))
+    with pytest.raises(UserError, match="act in the package's environments alone"):
+        watch.load_agent("OwnCentre-v0", Centre(), str(run.path(MODEL)))
     assert result["versions"]["torch"] and result["hyperparameters"] == run.hyperparameters
     run.path(MODEL).write_bytes(b"nonsense")
     with pytest.raises(UserError, match=r"the policy in .* cannot be read"):

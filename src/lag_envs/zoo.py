@@ -33,7 +33,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "examples:\n  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs\n"
         "  python -m lag_envs.zoo train --help    the options of a script",
         add_help=False,
-        allow_abbrev=False,
     )
     parser.add_argument("script", help="train, enjoy, record_video, record_training, ...")
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="PACKAGE")
