@@ -272,7 +272,7 @@ LOG = {
 
 
 @needs_git
-@pytest.mark.parametrize("how", every(3, LOG))
+@pytest.mark.parametrize("how", every(5, LOG))
 @pytest.mark.parametrize("chain", [False, True], ids=["by hand", "with the chain rebuilt"])
 def test_the_log_is_edited(board, how, chain):
     before = board.log.read_bytes()

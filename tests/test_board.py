@@ -283,7 +283,7 @@ def outcome(folder):
 # --- spreading ---
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_map_submissions(tmp_path, jobs):
     folders = [tmp_path / name for name in ("a", "refused", "b", *["dies"] * (jobs - 1))]
     for folder in folders:

@@ -160,6 +160,7 @@ def test_page(written):
     assert '<html lang="en">' in text and "viewport" in text
 
 
+@pytest.mark.slow
 def test_page_tells_problems(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dummy_section, "jobs", lambda quick: [job("fails", "fails")])
     assert make_report(settings(tmp_path))

@@ -5,7 +5,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import PERFECT, covering
+from covering import PERFECT, covering, engine
 
 from lag_envs.report import conservation, leave_out
 from lag_envs.report.points import ROUNDING
@@ -122,7 +122,7 @@ def test_cosine_and_sine_stay_a_pair(name):
 MOVED = {"chance0": 1.0, "limit": 0.5, "x": 0.01, "self_radius": 0.5, "self_shell_radius": 0.5}
 
 
-@pytest.mark.parametrize("id", covering(i for i in FORMS if i in PERFECT))
+@pytest.mark.parametrize("id", covering((i for i in FORMS if i in PERFECT), of=engine))
 def test_every_constant_changes_something(id):
     """Change each constant, by 1e-3 unless stated otherwise: the results of a start or step differ."""
     env = gym.make(id).unwrapped

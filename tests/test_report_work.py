@@ -162,7 +162,7 @@ def test_held_controls_are_one_call(name):
 
 
 @pytest.mark.parametrize("method", ["dopri5", "dop853", "lsoda", "Radau"])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", every(2, VARIANTS))
 def test_libraries_are_given_the_scene(name, method):
     """SciPy ends where the exact flow does, on every equation, over several control steps."""
     rival = peers.SciPy(method, 1e-11)
@@ -172,7 +172,7 @@ def test_libraries_are_given_the_scene(name, method):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("steps", [slow(1), 20])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", every(2, VARIANTS))
 def test_heyoka(name, steps, mode):
     """Its compiled step in a loop, and propagate_until over a longer time, alone and in blocks."""
     pytest.importorskip("heyoka")

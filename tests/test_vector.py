@@ -121,7 +121,7 @@ def assert_alike(native, sync, steps, seed=0):
 
 
 @each_id
-@pytest.mark.parametrize(("n", "steps"), [(1, 3000), (7, 2000), (64, 600)])
+@pytest.mark.parametrize(("n", "steps"), [slow(1, 3000), (7, 2000), slow(64, 600)])
 def test_same_bits(env_id, n, steps):
     native, sync = pair(env_id, n, **lasting(env_id, 500))
     assert_same(native.reset(seed=17), sync.reset(seed=17))

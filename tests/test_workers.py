@@ -38,6 +38,7 @@ def work(what):
     return greeting, os.environ["OMP_NUM_THREADS"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_whatever_becomes_of_one_the_others_go_on():
     given = ["dies", "is killed", "hangs", "raises", "returns what cannot be sent", "works", "works too"]
