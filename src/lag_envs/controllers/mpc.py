@@ -379,8 +379,8 @@ def planner(
     task : Task
         The task to control, with continuous actions.
     weights : mapping, optional
-        Final cost of the squared distance from rest, by entry of the state; for angles of twice 1 minus its
-        cosine.
+        Final cost of the squared distance from rest, by entry of the state; for angles, which have the unit
+        rad, of twice 1 minus its cosine.
     rest : mapping, optional
         Nonzero entries of the state at rest.
     **numbers

@@ -73,7 +73,8 @@ def away(task: Task, weights: Mapping[str, float], rest: Mapping[str, float]) ->
     task : Task
         The task.
     weights : mapping
-        For state entries, the weight of the squared distance, for angles of twice 1 minus its cosine.
+        For state entries, the weight of the squared distance; for angles, which have the unit rad, of twice 1
+        minus its cosine.
     rest : mapping
         The entries at rest; 0 if not given.
     """
