@@ -110,7 +110,6 @@ def run_stub(body, **options):
     return subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True, **options)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="needs signals")
 def test_no_option_is_abbreviated(capsys):
     with pytest.raises(SystemExit):
         cli.main(["cache", "--clea"])
@@ -121,6 +120,7 @@ def test_a_report_has_no_ids(capsys):
     assert f"{ID} is an id, and the report measures all environments" in told(capsys, "report", ID)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
 def test_sigterm_is_like_ctrl_c():
     body = "try:\n        print('begins', flush=True); time.sleep(60)\n    finally: print('tidies')"
     child = run_stub(body, stdout=subprocess.PIPE)

@@ -212,12 +212,19 @@ def test_build(run):
     assert os.listdir("other") == ["index.html"] and Path("other/index.html").read_text() == "mine"
 
 
+def test_what_does_not_exist_is_told_at_once(run):
+    write("a", "An agent")
+    run("add", "a", "--nonce", "n")
+    for arguments, told in (
+        (("serve", "--port", "99999999"), "--port must be a number from 0 to 65535, got 99999999"),
+        (("list", "--board", "typo"), "there is no board in typo; --board names"),
+        (("audit", "--pin", "typo.json"), "--pin: there is no file typo.json"),
+    ):
+        status, _, err = run(*arguments)
+        assert status == 2 and told in err
+
+
 @pytest.mark.slow
-def test_a_port_and_a_board_that_do_not_exist(run):
-    assert "--port must be a number from 0 to 65535, got 99999999" in run("serve", "--port", "99999999")[1]
-    assert "there is no board in typo; --board names" in run("list", "--board", "typo")[1]
-
-
 def test_serve(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")

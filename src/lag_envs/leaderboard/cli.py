@@ -390,6 +390,8 @@ def _audit(args: argparse.Namespace) -> int:
     board = Board(args.board)
     if not os.path.lexists(board.log):
         raise BoardError(f"{board.folder} has no log; there is nothing to audit")
+    if args.pin and not args.pin.exists():
+        raise BoardError(f"--pin: there is no file {args.pin}")
     with tqdm(desc="playing again", unit=" results", disable=None, leave=False, delay=1.0) as bar:
 
         def tell(finding: Finding) -> None:
