@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured_entry
 
 
@@ -97,7 +98,7 @@ def score(env_id: str, mean_return: float) -> float | None:
 
 
 def share_of_privileged(env_id: str) -> float | None:
-    """Return the best policy's mean return as a share of the reference's, which has privileged information.
+    """Return the best attempt's mean return as a share of the reference's, which has privileged information.
 
     None if the environment is not open (`lag_envs.tasks.record.Open`), or was not measured.
 
@@ -109,7 +110,8 @@ def share_of_privileged(env_id: str) -> float | None:
     found = measured_entry(env_id).get("measured", {})
     if "privileged" not in found:
         return None
-    return float(found[measured_entry(env_id)["scale"]["policy"]]["mean"] / found["privileged"]["mean"])
+    best = max(found[name]["mean"] for name in TASKS[env_id].open.tried if name in found)
+    return float(best / found["privileged"]["mean"])
 
 
 def in_words(env_id: str, total: float, whole: bool = True) -> str:

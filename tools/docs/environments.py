@@ -367,7 +367,11 @@ def _returns(env_id: str) -> str:
     if not found:
         return "Not measured yet."
     best = found["scale"]["policy"]
-    names = {"random": "random actions", "zero": "zero control", best: f"{best}, the best policy known"}
+    names = {
+        "random": "random actions",
+        "zero": "zero control",
+        best: f"{best}, the best policy known when the protocol began",
+    }
     names["optimum"] = f"the optimum: {TASKS[env_id].optimum.text}" if TASKS[env_id].optimum else ""
     names["privileged"] = f"a reference that {TASKS[env_id].open.knows}" if TASKS[env_id].open else ""
     rows = [
@@ -392,7 +396,7 @@ def _open(env_id: str) -> str:
     text = "**This task is open.** "
     if share is not None:
         text += (
-            f"The best policy known gets {100.0 * share:.0f} % of the return of a reference that "
+            f"The best attempt gets {100.0 * share:.0f} % of the return of a reference that "
             f"{task.open.knows}. "
         )
     rows = [
