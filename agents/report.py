@@ -247,7 +247,7 @@ def _real_time(env_id: str) -> list[str]:
         )
         if row["allowed"] is not None:
             text += (
-                f" In real time its plans are made {1e3 * row['allowed']:.3g} ms ahead, in a process of their"
+                f" In real time its plans are made {1e3 * row['allowed']:g} ms ahead, in a process of their"
                 f" own. That costs {plus_minus(*row['loss'])} of the return, measured in {found['episodes']}"
                 f" other episodes, and leaves {plus_minus(*row['return'])}."
             )
