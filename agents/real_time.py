@@ -2,7 +2,7 @@
 
 ``python -m agents.real_time`` plays episodes by the clock with every controller that plans. Where planning
 takes longer than a step, it plans ahead in a process of its own, by `Controller.real_time`. What that costs
-is measured in other episodes, in the same ones with and without haste; `docs/agents.md` shows both.
+is measured by the returns with and without it in other, equal episodes. `docs/agents.md` shows both.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def clocked(env_id: str, name: str, episodes: int) -> NDArray[np.float64]:
 
 
 def measured(env_id: str, name: str, clocked_episodes: int, episodes: int) -> dict[str, Any]:
-    """Return a controller's times [s], and its returns with and without haste."""
+    """Return a controller's times [s], its return where it plans ahead, and what that costs."""
     task = TASKS[env_id]()
     hurry = task.controllers[name].real_time
     seconds = clocked(env_id, name, clocked_episodes)
