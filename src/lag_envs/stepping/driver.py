@@ -29,7 +29,7 @@ from lag_envs.stepping.series import TOLERANCE, Series
 LARGEST_COUNT = 20_000
 #: So is one that would need a substep below this part of it.
 SMALLEST_PART = 1e-9
-#: What derivatives may leave out, relative to themselves.
+#: What the derivatives of a control step may leave out, relative to themselves.
 COMPLETE = 1e-13
 
 
@@ -161,13 +161,15 @@ def compile_advance_block(
     return compile_python("advance_block", _advance_block, attempt, rest, **numbers)
 
 
-def _enough(length, ratio, order):  # type: ignore[no-untyped-def]
+def _enough(length, dt, rest, order):  # type: ignore[no-untyped-def]
     """Return the length of a substep with which derivatives leave out little enough, infinity if they do.
 
     The certificate does not cover derivatives: at rest a series has no terms, while those of its derivatives
-    may be large. `ratio` estimates what they leave out from their last terms.
+    may be large. `rest` estimates what they leave out, relative to themselves, from their last terms. All
+    substeps of a step `dt` together may leave out `COMPLETE`.
     """
-    return length * max(0.05, 0.9 * (tolerance / ratio) ** (1.0 / order)) if ratio > tolerance else np.inf
+    excess = rest * dt / (COMPLETE * length)
+    return length * max(0.05, 0.9 * excess ** (-1.0 / (order - 1))) if excess > 1.0 else np.inf
 
 
 def _advance_tangent(rows, slopes, kept, dt, order):  # type: ignore[no-untyped-def]
@@ -194,10 +196,10 @@ def _advance_tangent(rows, slopes, kept, dt, order):  # type: ignore[no-untyped-
             slopes[status] = dt - before
             slopes[status + 1] = used
             tangent(slopes, 0, order)
-            ratio = 0.0
+            rest = 0.0
             for i in range(last, len(slopes)):
-                ratio = max(ratio, slopes[i])
-            enough = enough_of(used, ratio, order)
+                rest = max(rest, slopes[i])
+            enough = enough_of(used, dt, rest, order)
             if enough < np.inf:
                 rows[left], rows[wish], longest = before, enough, enough
                 for i in range(2 * n):
@@ -248,7 +250,7 @@ def compile_advance_tangents(record: SeriesRecord, columns: tuple[str, ...]) -> 
 
 @cache
 def _compile_enough() -> Callable:
-    return compile_python("enough_of", _enough, inner=True, tolerance=COMPLETE)
+    return compile_python("enough_of", _enough, inner=True, COMPLETE=COMPLETE)
 
 
 def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
@@ -322,7 +324,9 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
                     used = before[2 * n, i] - remains
                     lane = first + whose[i]
                     if used > 0.0 and back and remains == 0.0:
-                        longest[lane] = min(longest[lane], enough_of(used, table[bounds + wanted, i], order))
+                        longest[lane] = min(
+                            longest[lane], enough_of(used, dt, table[bounds + wanted, i], order)
+                        )
                     elif used > 0.0:
                         for r in range(2 * n + 1):
                             kept[r, end] = before[r, i]
@@ -359,7 +363,7 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
                 pull(rows_again, i, dt, order, -1.0)
             for i in range(some):
                 lane, used = first + lanes[begin + i], kept[2 * n + 1, begin + i]
-                longest[lane] = min(longest[lane], enough_of(used, again[bounds + wanted, i], order))
+                longest[lane] = min(longest[lane], enough_of(used, dt, again[bounds + wanted, i], order))
             for r in range(wanted):
                 for i in range(some):
                     bars[r, lanes[begin + i]] = again[bounds + r, i]
