@@ -371,18 +371,12 @@ class _RowStepBackward(torch.autograd.Function):
         by_observations: Tensor,
         by_rewards: Tensor,
     ) -> tuple[Tensor, ...]:
-        found = model.vjp(
-            *_rows(model, states, actions, targets),
-            by_states=_numbers(by_states),
-            by_observations=_numbers(by_observations),
-            by_rewards=_numbers(by_rewards),
-            ends=_numbers(ends),
-        )
-        slopes = found.states, found.actions.reshape(actions.shape), found.targets
         given = states, actions, targets
+        z, *seeds = map(_numbers, (ends, by_states, by_observations, by_rewards))
+        slopes = model.reverse().pull(*map(_numbers, given), z, z, *seeds)
         return tuple(
             torch.from_numpy(np.ascontiguousarray(slope)).to(x.dtype)
-            for slope, x in zip(slopes, given, strict=True)
+            for slope, x in zip(slopes, given, strict=False)
         )
 
     @staticmethod
