@@ -199,7 +199,16 @@ def pulled(
     rows: Sequence[int] | None = None,
 ) -> Array:
     """Return `vjp` of rows of checked arrays, side by side; `rows` are their numbers in error messages."""
-    found, refused = _derivatives(scene, by).vjp(states, controls, dt, cotangents)
+    derivatives = _derivatives(scene, by)
+    found, refused = derivatives.vjp(states, controls, dt, cotangents)
+    if refused:
+        row = slice(refused - 1, refused)
+        if not derivatives.jacobian(states[row], controls[row], dt)[1]:  # the step itself is taken
+            i = refused - 1 if rows is None else rows[refused - 1]
+            raise ValueError(
+                f"the gradient of row {i} is not finite: its cotangent {cotangents[refused - 1].tolist()} is "
+                "too large; scale it down"
+            )
     _check_refused(scene, states, controls, dt, refused, rows)
     return found
 
