@@ -201,13 +201,13 @@ def pulled(
     """Return `vjp` of rows of checked arrays, side by side; `rows` are their numbers in error messages."""
     derivatives = _derivatives(scene, by)
     found, refused = derivatives.vjp(states, controls, dt, cotangents)
-    if refused:
-        row = slice(refused - 1, refused)
-        if not derivatives.jacobian(states[row], controls[row], dt)[1]:  # the step itself is taken
-            i = refused - 1 if rows is None else rows[refused - 1]
+    if refused or not np.isfinite(found).all():
+        i = refused - 1 if refused else int(np.argwhere(~np.isfinite(found))[0, 0])
+        slopes, step_refused = derivatives.jacobian(states[i : i + 1], controls[i : i + 1], dt)
+        if not step_refused and np.isfinite(slopes).all():
             raise ValueError(
-                f"the gradient of row {i} is not finite: its cotangent {cotangents[refused - 1].tolist()} is "
-                "too large; scale it down"
+                f"the gradient of row {i if rows is None else rows[i]} is not finite: its cotangent "
+                f"{cotangents[i].tolist()} is too large; scale it down"
             )
     _check_refused(scene, states, controls, dt, refused, rows)
     return found
