@@ -118,7 +118,7 @@ class Learner:
             (self.actor(seen[batch]) - wanted[batch]).square().mean().backward()
             self.adam.step()
 
-    def weights(self) -> list[nn.Parameter]:
+    def weights(self) -> list[torch.nn.Parameter]:
         """Return everything that is learned."""
         return list(self.actor.parameters())
 

@@ -74,7 +74,7 @@ TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 SCALE = "lag_envs.sb3.ScaledReward"
 #: The argument of each wrapper that is known.
 WRAPPERS = {TIME_LIMIT: "max_episode_steps", DISCRETISE: "bins", SCALE: "factor"}
-#: The Zoo's hyperparameters that are not arguments of a learner's class, with their types if they are numbers.
+#: The Zoo's hyperparameters that are not arguments of a learner's class; with their types, if numbers.
 ZOO: Mapping[str, type | None] = dict.fromkeys(
     ("n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs", "noise_type")
 ) | {"n_envs": int, "noise_std": float, "frame_stack": int}

@@ -366,7 +366,8 @@ def test_degrees():
     angles = np.degrees(2.0 + np.cos(0.3 * np.arange(100)))
     given = [(np.stack([a, np.full(100, np.nan)], axis=1), None, 0.02) for a in (angles, np.radians(angles))]
     found = [doubtful_units(scene, recordings_of(scene, [one])) for one in given]
-    assert found == [["theta spans 18.2 turns in a recording; if it was measured in degrees, use np.radians"], []]
+    told = "theta spans 18.2 turns in a recording; if it was measured in degrees, use np.radians"
+    assert found == [[told], []]
     # They are told before the search, even if that fails.
     with pytest.warns(FitWarning, match="theta spans"), pytest.raises(ValueError, match="too few"):
         scene.fit([(given[0][0][:3], None, 0.02)], ["length"])
@@ -414,7 +415,7 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
         ([{"states": STATES}], {}, "got a dict$"),
         (STATES, {}, r"at least one, got an array of shape \(20, 2\)$"),
         ([(np.ma.masked_invalid(STATES), None, DT)], {}, r"got a masked array; call filled\(np.nan\)$"),
-        ([([[1.0, None]] * 9, None, DT)], {}, r"got a list of 9; np.array\(states, float\) makes NaN of None$"),
+        ([([[1.0, None]] * 9, None, DT)], {}, r"a list of 9; np.array\(states, float\) makes NaN of None"),
         ([(STATES.astype(object), None, DT)], {}, "got an array of type object; np.array"),
         ([(STATES + 0j, None, DT)], {}, "NaN for what was not measured, got an array of type complex128$"),
         ((STATES, None, DT), {}, r"a list of \(states, controls, dt\), got one; put it into a list$"),

@@ -67,7 +67,7 @@ def test_bad_input_is_named():
             model.observe(wrong, 0.1)
         with pytest.raises(ValueError, match=message):
             model.kicked(wrong, np.zeros((0, 1)))
-    with pytest.raises(ValueError, match="targets must be finite, got .nan. in row 0"):
+    with pytest.raises(ValueError, match=r"targets must be finite, got \[nan\] in row 0"):
         model.observe(state, np.nan)
     with pytest.raises(ValueError, match=r"draws must have shape \(0, 2\), got \(1, 2\)"):
         model.kicked(state, np.zeros((1, 2)))

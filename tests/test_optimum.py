@@ -334,7 +334,7 @@ def test_between_targets_values_are_interpolated():
     expected = 0.5 * (solution.values[1][0, i, j, k] + solution.values[2][0, i, j, k])
     assert solution.value(0, middle, np.array([between]))[0] == pytest.approx(expected, rel=1e-6)
     assert solution.value(0, -middle, np.array([-between]))[0] == pytest.approx(expected, rel=1e-6)
-    with pytest.raises(ValueError, match="times must lie between 0 and [0-9]+, got -1 to -1"):
+    with pytest.raises(ValueError, match=r"times must lie between 0 and [0-9]+, got -1 to -1"):
         solution.value(-1, at_node)
 
 

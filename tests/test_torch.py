@@ -157,7 +157,9 @@ def test_gradient_by_the_start():
         envs.reset(options={"state": 2.0 * start})
 
 
-@pytest.mark.parametrize("way", ["set_state", "masked", "envs.set_state", "envs.reset", "envs.step", "in place"])
+@pytest.mark.parametrize(
+    "way", ["set_state", "masked", "envs.set_state", "envs.reset", "envs.step", "in place"]
+)
 @pytest.mark.parametrize("history", [False, True])
 def test_gradients_are_those_at_the_environments_state(way, history):
     envs, start = TorchVectorEnv(IDS[0], 2), np.array([[0.0, 0.0, 3.0, 0.1], [0.0, 0.0, 0.1, 0.0]])
@@ -189,7 +191,7 @@ def test_gradients_are_those_at_the_environments_state(way, history):
     np.testing.assert_allclose(slope[:, 0].numpy(), expected, rtol=1e-6)
     # What was set has no history, and the rest of a batch keeps its own.
     assert (before is None) == (not own or not history)
-    assert before is None or before.tolist()[0] == [0.0] and (before[1] != 0.0) == (way == "masked")
+    assert before is None or (before.tolist()[0] == [0.0] and (before[1] != 0.0) == (way == "masked"))
 
 
 def test_states_cannot_be_assigned():

@@ -241,9 +241,9 @@ class TorchVectorEnv:
         if not np.array_equal(state.detach().numpy(), now):
             if state.requires_grad:
                 raise RuntimeError(
-                    "the environments are not where the history of `state` leads: they were stepped, reset or "
-                    "set through `envs`, a step was refused, or `state` was changed in place; call detach() "
-                    "to continue from where they are, and reset and set_state of this object"
+                    "the environments are not where the history of `state` leads: a step was refused, or they "
+                    "were changed through `envs`, or `state` in place; call detach() to continue from where "
+                    "they are, and use reset and set_state of this object"
                 )
             state = torch.from_numpy(now)
         self._keep(state)
@@ -455,8 +455,8 @@ class _RowStepBackward(torch.autograd.Function):
         by_rewards: Tensor,
     ) -> tuple[Tensor, ...]:
         given = states, actions, targets
-        z, *seeds = map(_numbers, (ends, by_states, by_observations, by_rewards))
-        slopes = model.reverse().pull(*map(_numbers, given), z, z, *seeds)
+        y, a, g, z, *seeds = map(_numbers, (*given, ends, by_states, by_observations, by_rewards))
+        slopes = model.reverse().pull(y, a, g, z, z, *seeds)
         return tuple(
             torch.from_numpy(np.ascontiguousarray(slope)).to(x.dtype)
             for slope, x in zip(slopes, given, strict=False)

@@ -516,7 +516,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def moment(self) -> tuple[int, int]:
-        """Two numbers, at least one of which is another whenever the states may be: steps, and other starts."""
+        """Numbers of steps and of other starts: the states stay as they are while both do."""
         return self._turn, self._starts
 
     @property

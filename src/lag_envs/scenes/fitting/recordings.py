@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 #: At most, for angles whose rates alone were measured: starts that are tried for each, those tried for all of
 #: them together, and samples compared.
 TRIED, MOST_TRIED, COMPARED = 16, 4096, 64
-#: An angle that spans more turns, or is more often over half a turn from the sample before, may be in degrees.
+#: An angle may be in degrees if it spans more turns, or moves over half a turn in more than this part of
+#: its steps.
 MANY_TURNS, OFTEN = 100.0, 0.1
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
