@@ -241,7 +241,7 @@ class TorchVectorEnv:
         if not np.array_equal(state.detach().numpy(), now):
             if state.requires_grad:
                 raise RuntimeError(
-                    "the environments are not where the history of `state` leads: a step was refused, or they "
+                    "the environments are not where the history of `state` leads: a step was refused, they "
                     "were changed through `envs`, or `state` in place; call detach() to continue from where "
                     "they are, and use reset and set_state of this object"
                 )
