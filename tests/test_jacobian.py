@@ -12,6 +12,7 @@ from mpmath.libmp import to_rational
 from reference import flow, random_cases
 
 from lag_envs import scenes
+from lag_envs.envs.model import Model
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.report.oracle import Oracle
 from lag_envs.scenes import (
@@ -23,9 +24,11 @@ from lag_envs.scenes import (
     Scene,
     StepRefused,
     TwoLinkArm,
+    parameter,
 )
 from lag_envs.scenes.incline import Incline
 from lag_envs.stepping.general import stepper_of
+from lag_envs.tasks.pivoted_bar import SwingUp
 
 CASES = {
     "cart_pole": (CartPole(friction=0.2), [0.3, -1.0, 2.0, 3.0], [4.0], 0.02),
@@ -191,5 +194,74 @@ def test_step_that_is_refused():
         bar.jacobian([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1e12]])
     with pytest.raises(StepRefused, match=r"cosine of theta, .* beyond 2.6e\+07 rad; subtract whole turns"):
         RotaryPendulum().jacobian([0.2, 1.0, 3e7, 0.0], 0.1, dt=0.02)
+    far = r"the gradient of row 1 needs sine and cosine of theta=27000000, which .* subtract whole turns"
+    with pytest.raises(StepRefused, match=far):
+        bar.vjp([[0.0, 0.0, 3.0, 0.0], [0.0, 0.0, 2.7e7, 0.0]], 0.0, 0.02, np.ones((2, 4)))
+    with pytest.raises(StepRefused, match=r"row 0 .* theta=26000000"):  # after the step it has got there
+        Model(SwingUp()).vjp([[0.0, 0.0, 26e6 - 1e-3, 1.0]], [0.0], by_rewards=1.0)
     with pytest.raises(StepRefused, match="the step of row 1"):
         Rope().jacobian([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]], dt=0.02)
+
+
+# --- what the certificate of the step does not cover ---
+
+
+class Well(Scene):
+    """A mass on a stiff spring, and another one that only the motion of the first would slow down."""
+
+    coordinates = {"x": "m", "y": "m"}
+    controls = {"force": "N"}
+    stiffness: float = parameter(1e6, "N/m")
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2 + 0.5 * v.y**2 * (1.0 + q.x**2)
+
+    def potential(self, q, xp):
+        return self.stiffness * (0.5 * q.x**2 + q.x**4) + q.y**2
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.force}
+
+
+@pytest.mark.parametrize("stiffness", [1e4, 1e6])
+def test_at_rest_where_series_have_no_terms(stiffness):
+    scene, dt, w = Well(stiffness=stiffness), 0.02, math.sqrt(stiffness)
+    c, s = math.cos(w * dt), math.sin(w * dt)
+    exact = np.array([[c, s / w], [-w * s, c]])
+    by_force = np.array([(1.0 - c) / w**2, s / w])
+    a, b = scene.jacobian([0.0] * 4, 0.0, dt)
+    np.testing.assert_allclose(a[:2, :2], exact, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(b[:2, 0], by_force, rtol=1e-12, atol=1e-14)
+    for row in range(2):
+        by_state, by_control = scene.vjp([0.0] * 4, 0.0, dt, np.eye(4)[row])
+        np.testing.assert_allclose(by_state[:2], exact[row], rtol=1e-12, atol=1e-12 * w)
+        np.testing.assert_allclose(by_control[0], by_force[row], rtol=1e-12)
+
+
+class Brake(Scene):
+    """A mass that a constant force pulls against a brake whose force changes its sign very fast."""
+
+    coordinates = {"x": "m"}
+    controls = {"brake": "N"}
+    mass: float = parameter(1.0, "kg", above=0.0)
+    more: float = parameter(0.0, "N", least=0.0)
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * self.mass * v.x**2
+
+    def potential(self, q, xp):
+        return -self.mass * q.x
+
+    def applied(self, q, v, u, xp):
+        return {"x": -(u.brake + self.more) * xp.tanh(v.x / 0.01)}
+
+
+@pytest.mark.parametrize(("mass", "more"), [(1.0, 0.0), (1.0, 1e-12), (1.0, 1e-6), (1e9, 0.0), (1e-8, 0.0)])
+def test_what_is_multiplied_by_hardly_anything_has_its_derivatives(mass, more):
+    """The brake that does not act changes the velocity by the integral of -tanh, from -2 to 0."""
+    scene, state = Brake(mass=mass, more=more), [0.0, -0.02]
+    exact = 0.01 * (2.0 + math.log1p(math.exp(-4.0)) - math.log(2.0)) / mass
+    _, by_control, by_more = scene.jacobian(state, 0.0, 0.02, parameters=["more"])
+    found = scene.vjp(state, 0.0, 0.02, [0.0, 1.0], parameters=["more"])
+    for number in (by_control[1, 0], by_more[1, 0], found[1][0], found[2][0]):
+        assert number == pytest.approx(exact, rel=1e-12 if more < 1e-9 else 1e-4)

@@ -267,21 +267,33 @@ def test_renewed_plans_are_the_same_alone_and_after_a_restart():
 
 
 def test_a_value_that_overflows_loses_no_plan(monkeypatch):
-    """At rest dry friction is so steep that the value grows without limit."""
-    task = make_task(AcrobotReal.id)
-    agent = build(task, "MPC", ahead=8)
-    solve, finite = agent.planner._solve, []
+    task = make_task(PendubotReal.id)
+    agent = build(task, "MPC")
+    solve, calls = agent.planner._solve, []
 
-    def watched(*args):
+    def overflowing(*args):
         change, gains = solve(*args)
-        finite.append(np.isfinite(change).all())
-        return change, gains
+        calls.append(change)
+        return (np.full_like(change, np.nan), gains * np.nan) if len(calls) == 1 else (change, gains)
 
-    monkeypatch.setattr(agent.planner, "_solve", watched)
+    monkeypatch.setattr(agent.planner, "_solve", overflowing)
     x = np.array([task.centre])
     plan = agent._make(agent._blank(x), x, np.zeros(1), False)
-    assert not all(finite)
+    assert len(calls) > 1
     assert np.isfinite(plan.actions).all() and np.isfinite(plan.gains).all()
+
+
+def test_at_rest_friction_has_its_slope():
+    """It changes its sign over 0.01 rad/s, so fast that linear motion dies out within a control step."""
+    task = make_task(AcrobotReal.id)
+    scene, rest = task.scene, np.array(task.centre)
+    n, h, fine = len(rest), 1e-7, 40
+    held = np.zeros((fine, len(scene.control_names)))
+    moved = [
+        scene.simulate(rest + sign * h * row, held, 0.02 / fine)[-1] for row in np.eye(n) for sign in (1, -1)
+    ]
+    slopes = (np.array(moved[::2]) - np.array(moved[1::2])).T / (2.0 * h)
+    np.testing.assert_allclose(scene.jacobian(rest, held[0], 0.02)[0], slopes, rtol=1e-5, atol=1e-5)
 
 
 def test_between_the_steps_of_a_plan_feedback_acts_on_the_line_between_its_states():

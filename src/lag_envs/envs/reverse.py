@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.derivation import code_of, form_of
-from lag_envs.scenes.steps import pulled
+from lag_envs.scenes.steps import check_turns, pulled
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.tracing import clip
@@ -91,6 +91,8 @@ class Reverse:
         by_states, by_observations, by_rewards : ndarray, shape (n, n_state), (n, n_observations), (n,)
             The gradient with respect to `after`, its observations, and the rewards.
         """
+        check_turns(self._task.scene, states)
+        check_turns(self._task.scene, ends)
         given = states, actions, targets, ends, after, by_states, by_observations, by_rewards[:, None]
         kicked = after is not ends
         count = len(states)

@@ -199,6 +199,7 @@ def pulled(
     rows: Sequence[int] | None = None,
 ) -> Array:
     """Return `vjp` of rows of checked arrays, side by side; `rows` are their numbers in error messages."""
+    check_turns(scene, states, rows)
     derivatives = _derivatives(scene, by)
     found, refused = derivatives.vjp(states, controls, dt, cotangents)
     if refused or not np.isfinite(found).all():
@@ -211,6 +212,21 @@ def pulled(
             )
     _check_refused(scene, states, controls, dt, refused, rows)
     return found
+
+
+def check_turns(scene: Scene, states: Array, rows: Sequence[int] | None = None) -> None:
+    """Raise StepRefused where a gradient needs sine and cosine of an angle that is too large for them.
+
+    Steps of scenes with a flow of their own go further than their gradients.
+    """
+    for name, unit, column in zip(scene.state_names, scene.state_units, states.T, strict=True):
+        if unit == "rad" and (far := np.abs(column) > LARGEST_ANGLE).any():
+            i = int(np.argmax(far))
+            raise StepRefused(
+                f"the gradient of row {i if rows is None else rows[i]} needs sine and cosine of "
+                f"{name}={column[i]:.9g}, which are not computed beyond {LARGEST_ANGLE:g} rad; "
+                f"subtract whole turns from {name}"
+            )
 
 
 def _rows(scene: Scene, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:

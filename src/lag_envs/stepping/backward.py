@@ -10,6 +10,7 @@ substeps are held fixed.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -98,7 +99,8 @@ class Backward(Series):
         lane : Lane
             The lane after the substep.
         bars : list of number
-            Cotangents before the substep in lanes that went backwards, with those of the sources added up.
+            Cotangents before the substep in lanes that went backwards, with those of the sources added up;
+            then an estimate of what they leave out, relative to them.
         back : condition
             Whether lanes that ended their control step went backwards. They do not if they are only a few of
             the lanes of a vector.
@@ -120,23 +122,80 @@ class Backward(Series):
         back = t.most(ended, wanted)
 
         def go_back() -> list:
-            found = self._back(t, start, h, order, bars)
-            return [t.select(ended, new, old) for new, old in zip(found, bars, strict=True)]
+            rest, whole = self._back(t, start, h, order, bars)
+            found = [t.select(ended, new, old) for new, old in zip(whole, bars, strict=True)]
+            return [*found, self._largest_ratio(t, h, rest, whole, bars)]
 
-        return lane, t.when(back, go_back, bars), back
+        return lane, t.when(back, go_back, [*bars, zero]), back
 
-    def _back(self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list:
-        """Return cotangents before the step just expanded from those after it, see `pull`."""
+    def _largest_ratio(self, t: Target, h: Any, parts: Sequence, *wholes: Sequence) -> Any:
+        """Return the largest ratio of parts of cotangents to the cotangents before and after the step.
+
+        Those of a coordinate's place and velocity count together: each often passes through zero.
+        """
+        n = self.size
+
+        def sizes(bars: Sequence) -> list:
+            size = [t.abs(bar) for bar in bars]
+            return [t.fma(h, *pair) for pair in zip(size[:n], size[n : 2 * n], strict=True)] + size[2 * n :]
+
+        total, least = t.number(0.0), t.number(sys.float_info.min)
+        for part, before, after in zip(*map(sizes, (parts, *wholes)), strict=True):
+            ratio = t.div(part, t.add(least, t.add(before, after)))
+            total = t.select(t.less(total, ratio), ratio, total)
+        return total
+
+    def _back(
+        self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence
+    ) -> tuple[list, list]:
+        """Return cotangents before the step just expanded from those after it, see `pull`.
+
+        Before them stands an estimate of what the cotangents leave out: a fifth of what the last terms
+        contribute, and less of the last but one, since there may be only odd or only even terms.
+        """
+        one, zero = t.number(1.0), t.number(0.0)
+        fifth, fiftieth = t.number(0.2), t.number(0.02)
+
+        def sweep(turn: Any, found: Sequence) -> list:
+            whole = t.below(t.index(0), turn)
+
+            def weight(k: Any) -> Any:
+                last = t.below(t.minus(order, k), t.index(1))
+                but_one = t.below(t.minus(order, k), t.index(2))
+                return t.select(whole, one, t.select(last, fifth, t.select(but_one, fiftieth, zero)))
+
+            direct = t.select(whole, one, zero)
+            return [*found[len(ends) :], *self._sweep(t, start, h, order, ends, weight, direct)]
+
+        found = t.loop(t.index(0), t.index(2), [zero] * (2 * len(ends)), sweep)
+        return found[: len(ends)], found[len(ends) :]
+
+    def _sweep(
+        self,
+        t: Target,
+        start: ExpansionStart,
+        h: Any,
+        order: Any,
+        ends: Sequence,
+        weight: Callable,
+        direct: Any,
+    ) -> list:
+        """Return cotangents before the step, where its terms of order k count by a weight.
+
+        Cotangents also remain what they are, by the weight `direct`.
+        """
         self._clear(t, order)
         n = self.size
 
         def seed(k: Any, carried: Sequence) -> list:
             per = t.mul(h, t.reciprocal(t.plus(k, 1)))
             for i in range(n):
-                t.store(self._bar("v", i), k, t.fma(per, ends[i], ends[n + i]))
+                bar = t.fma(per, ends[i], ends[n + i])
+                t.store(self._bar("v", i), k, t.mul(weight(k), bar))
             return []
 
         t.loop(t.index(0), t.plus(order, 1), [], seed)
+        ends = [t.mul(direct, end) for end in ends]
 
         def back(m: Any, carried: Sequence) -> list:
             self._one_order_back(t, start, h, t.minus(order, m), order)

@@ -29,6 +29,8 @@ from lag_envs.stepping.series import TOLERANCE, Series
 LARGEST_COUNT = 20_000
 #: So is one that would need a substep below this part of it.
 SMALLEST_PART = 1e-9
+#: What derivatives may leave out, relative to themselves.
+COMPLETE = 1e-13
 
 
 def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
@@ -159,52 +161,76 @@ def compile_advance_block(
     return compile_python("advance_block", _advance_block, attempt, rest, **numbers)
 
 
-def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
+def _enough(length, ratio, order):  # type: ignore[no-untyped-def]
+    """Return the length of a substep with which derivatives leave out little enough, infinity if they do.
+
+    The certificate does not cover derivatives: at rest a series has no terms, while those of its derivatives
+    may be large. `ratio` estimates what they leave out from their last terms.
+    """
+    return length * max(0.05, 0.9 * (tolerance / ratio) ** (1.0 / order)) if ratio > tolerance else np.inf
+
+
+def _advance_tangent(rows, slopes, kept, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of a lane, by which the step is divided, `slopes` those of `compile_series_tangent`.
-    Where the step is `GUIDED`, they differ in their constants.
+    `rows` are those of a lane, `slopes` those of `compile_series_tangent`; `kept` has room for what a substep
+    that turns out to be too long has to restore.
     """
     rows[status] = 0.0
-    rows[left] = rows[wish] = rows[span] = dt
+    rows[left] = rows[wish] = rows[span] = longest = dt
+    last = q + 2 + len(kept)  # behind the matrix
     while rows[left] > 0.0:
         before = rows[left]
+        # What is longer by little only would leave a rest too short to be stepped.
+        if rows[wish] > 1.001 * longest:
+            rows[wish] = longest
         attempt(rows, 0, order, tolerance)
         if rows[left] < before:
-            slopes[status] = dt - before
-            slopes[status + 1] = before - rows[left]
-            tangent(slopes, 0, order)
             for i in range(2 * n):
-                if GUIDED:
-                    rows[q + i] = slopes[q + i]
-                else:
+                kept[i] = slopes[q + i]
+            for i in range(2 * n, len(kept)):
+                kept[i] = slopes[q + 2 + i]
+            used = before - rows[left]
+            slopes[status] = dt - before
+            slopes[status + 1] = used
+            tangent(slopes, 0, order)
+            ratio = 0.0
+            for i in range(last, len(slopes)):
+                ratio = max(ratio, slopes[i])
+            enough = enough_of(used, ratio, order)
+            if enough < np.inf:
+                rows[left], rows[wish], longest = before, enough, enough
+                for i in range(2 * n):
+                    rows[q + i] = slopes[q + i] = kept[i]
+                for i in range(2 * n, len(kept)):
+                    slopes[q + 2 + i] = kept[i]
+            else:
+                for i in range(2 * n):
                     slopes[q + i] = rows[q + i]
         if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
             return -np.int64(rows[status])
     return np.int64(rows[status])
 
 
-def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-untyped-def]
+def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take a control step from each row of `values`; return the row that was refused, or 0.
 
     A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes` is the
-    matrix of derivatives of places and velocities, row by row, and is replaced too. Where a number of `guide`
-    is not 0, it takes the place of an input when the step is divided.
+    matrix of derivatives of places and velocities, row by row, and is replaced too.
     """
-    rows, matrix = np.zeros(size), status + 2
-    moving = np.zeros(matrix + slopes.shape[1])
+    rows, matrix, numbers = np.zeros(size), status + 2, slopes.shape[1]
+    moving = np.zeros(matrix + numbers + numbers // (2 * n))
+    kept = np.empty(2 * n + numbers)
     for i in range(values.shape[0]):
         for j in range(status):
             rows[j] = moving[j] = values[i, j]
-            if GUIDED and j < q and guide[j] != 0.0:
-                rows[j] = guide[j]
-        for j in range(slopes.shape[1]):
+        for j in range(numbers):
             moving[matrix + j] = slopes[i, j]
-        if advance(rows, moving, dt, order) < 0:
+        if advance(rows, moving, kept, dt, order) < 0:
             return i + 1
         for j in range(2 * n):
             values[i, q + j] = rows[q + j]
-        for j in range(slopes.shape[1]):
+        for j in range(numbers):
             slopes[i, j] = moving[matrix + j]
             if not abs(slopes[i, j]) < np.inf:
                 return i + 1
@@ -212,16 +238,24 @@ def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-unty
 
 
 @cache
-def compile_advance_tangents(record: SeriesRecord, columns: tuple[str, ...], guided: bool) -> Callable:
-    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`."""
-    helpers = compile_attempt(record, 1), compile_series_tangent(record, columns)
-    numbers = _numbers(record, TOLERANCE) | {"GUIDED": guided}
+def compile_advance_tangents(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
+    """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents`."""
+    helpers = compile_attempt(record, 1), compile_series_tangent(record, columns), _compile_enough()
+    numbers = _numbers(record, TOLERANCE)
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)
 
 
-def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
+@cache
+def _compile_enough() -> Callable:
+    return compile_python("enough_of", _enough, inner=True, tolerance=COMPLETE)
+
+
+def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
     """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
+
+    No substep is longer than its lane's entry of `longest`. Where that was too long for the derivatives, a
+    smaller one takes its place, and what was found for the lane is of no use.
 
     Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
@@ -235,7 +269,7 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     afterwards, last round first, again many lanes together.
     """
     wanted, count = len(pulled), given.shape[1]
-    table, before = np.zeros((bounds + wanted, BLOCK)), np.empty((2 * n + 1, BLOCK))
+    table, before = np.zeros((bounds + wanted + 1, BLOCK)), np.empty((2 * n + 1, BLOCK))
     inputs, bars = np.empty((q, BLOCK)), np.empty((wanted, BLOCK))
     again = np.zeros_like(table)
     rows, rows_again = table.reshape(-1), again.reshape(-1)
@@ -261,9 +295,9 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
         fill(table[status], 0.0, BLOCK)
         fill(table[left], 0.0, BLOCK)
         fill(table[left], dt, filled)
-        fill(table[wish], dt, BLOCK)
         for i in range(BLOCK):
             whose[i] = i
+            table[wish, i] = dt if i >= filled or dt <= 1.001 * longest[first + i] else longest[first + i]
         going, end, turns = filled, 0, 0
         while going > 0:
             if end + going > len(lanes):
@@ -286,13 +320,18 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
                 for i in range(begin, until):
                     remains = table[left, i]
                     used = before[2 * n, i] - remains
-                    if used > 0.0 and not (back and remains == 0.0):
+                    lane = first + whose[i]
+                    if used > 0.0 and back and remains == 0.0:
+                        longest[lane] = min(longest[lane], enough_of(used, table[bounds + wanted, i], order))
+                    elif used > 0.0:
                         for r in range(2 * n + 1):
                             kept[r, end] = before[r, i]
                         kept[2 * n + 1, end] = used
                         lanes[end] = whose[i]
                         end += 1
                     if remains > 0.0:
+                        if table[wish, i] > 1.001 * longest[lane]:
+                            table[wish, i] = longest[lane]
                         if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
                             return first + whose[i] + 1
                         for r in range(bounds + wanted):
@@ -318,6 +357,9 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
                     again[bounds + r, i] = bars[r, lane]
             for i in range(0, some, LANES):
                 pull(rows_again, i, dt, order, -1.0)
+            for i in range(some):
+                lane, used = first + lanes[begin + i], kept[2 * n + 1, begin + i]
+                longest[lane] = min(longest[lane], enough_of(used, again[bounds + wanted, i], order))
             for r in range(wanted):
                 for i in range(some):
                     bars[r, lanes[begin + i]] = again[bounds + r, i]
@@ -353,4 +395,5 @@ def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable
     width = lanes(record)
     numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
-    return compile_python("pull_all", _pull_all, compile_pull(record, sources, width), *loops, **numbers)
+    helpers = compile_pull(record, sources, width), _compile_enough(), *loops
+    return compile_python("pull_all", _pull_all, *helpers, **numbers)

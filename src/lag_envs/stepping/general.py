@@ -27,10 +27,6 @@ from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.rows import Rows
 from lag_envs.stepping.series import TOLERANCE
 
-#: Stands in for a parameter that is 0 when deciding how to divide a step, so that derivatives with respect to
-#: it are accurate.
-GUIDE = 1e-2
-
 
 class SeriesStepper:
     """One scene's control step by the general series, as lines of code and compiled functions.
@@ -191,16 +187,13 @@ class SeriesStepper:
         lowering, parts = self._tangents[by]
         constants = _evaluated(lowering.constants, parameters)
         exprs = {name: e for name, e in lowering.constants.items() if constants[name] == 0.0}
-        lifted: dict[str, Expr] = {}
+        lifted: set[str] = set()  # a parameter that is 0 brings in a further series
         for p in by:
             slopes = _evaluated({n: derivative(e, parameter(p)) for n, e in exprs.items()}, parameters)
-            lifted |= {name: e for name, e in exprs.items() if slopes[name] != 0.0}
-        # If a parameter that is 0 brings in a further series, steps must be short enough for that one too.
-        above = {name: parameters[name] or (GUIDE if name in by else 0.0) for name in parameters}
-        guide = _evaluated(lifted, above)
+            lifted |= {name for name in exprs if slopes[name] != 0.0}
         numbers = {f"p_{name}": float(parameters[name]) for name in self._parameters}
-        record = lowering.without(*parts, frozenset(exprs) - frozenset(lifted))
-        return SeriesTangent(self, record, constants, numbers, by, guide)
+        record = lowering.without(*parts, frozenset(exprs) - lifted)
+        return SeriesTangent(self, record, constants, numbers, by)
 
     # --- code -----------------------------------------------------------------------------------------------
 
@@ -247,8 +240,6 @@ class SeriesTangent:
         Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
     by : tuple of str
         Parameters with respect to which derivatives are taken, besides state and controls.
-    guide : mapping from str to float
-        Constants that decide how a step is divided, in place of `constants`.
     """
 
     def __init__(
@@ -258,7 +249,6 @@ class SeriesTangent:
         constants: Mapping[str, float],
         numbers: Mapping[str, float],
         by: tuple[str, ...],
-        guide: Mapping[str, float],
     ) -> None:
         from lag_envs.stepping.machine import slots_for
 
@@ -280,7 +270,6 @@ class SeriesTangent:
                 self._first[i, self._columns.index(name)] = 1.0
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
         self._known_linear: dict[float, tuple[Any, ...]] = {}
-        self._guide = np.array([guide.get(name, 0.0) for name in record.given])
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
         """Return the derivatives of the end states with respect to states, controls and parameters.
@@ -320,7 +309,7 @@ class SeriesTangent:
             if name in before:
                 values[:, i] = getattr(before[name], "value", before[name])
         slopes = np.repeat(self._first[None], count, axis=0)
-        refused = self._advance(values, slopes.reshape(count, self._first.size), self._guide, dt, order)
+        refused = self._advance(values, slopes.reshape(count, self._first.size), dt, order)
         if refused:
             return None, refused
 
@@ -348,15 +337,27 @@ class SeriesTangent:
 
         The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
         """
-        if self._stepper.mechanics.coupling or self._guide.any():
+        if self._stepper.mechanics.coupling:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
         linear = self._known_linear.get(dt) or self._linear(dt)
         self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
-        given, found = np.concatenate([states.T, controls.T]), np.empty((self._width, len(states)))
-        seeds = np.ascontiguousarray(cotangents.T)
-        refused = self._pull(given, seeds, found, *linear, dt, order)
-        if not refused and not np.isfinite(found).all():
+        given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
+        found, some = np.empty((self._width, len(states))), np.arange(len(states))
+        longest = np.full(len(states), dt)
+        while len(some):  # again those whose substeps were too long for the derivatives
+            pulled, shorter = np.empty((self._width, len(some))), longest[some]
+            refused = self._pull(
+                np.ascontiguousarray(given[:, some]), np.ascontiguousarray(seeds[:, some]), pulled, shorter,
+                *linear, dt, order,
+            )  # fmt: skip
+            if refused:
+                return None, int(some[refused - 1]) + 1
+            found[:, some] = pulled
+            too_long = shorter < longest[some]
+            longest[some] = shorter
+            some = some[too_long]
+        if not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
         return found.T, refused
 
@@ -398,7 +399,7 @@ class SeriesTangent:
     def _advance(self) -> Callable:
         from lag_envs.stepping.driver import compile_advance_tangents
 
-        return compile_advance_tangents(self._record, self._columns, bool(self._guide.any()))
+        return compile_advance_tangents(self._record, self._columns)
 
     @cached_property
     def _sources(self) -> tuple[str, ...]:

@@ -414,7 +414,8 @@ def compile_series_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Ca
 
     The rows are inputs, places and velocities as in `LaneLayout`, the time since the control step began, the
     step, and then the derivatives of the places and velocities by `columns`, as a matrix with `slots_for`
-    columns. Places, velocities and the matrix are replaced by those after the step.
+    columns. Places, velocities and the matrix are replaced by those after the step. Behind the matrix lies an
+    estimate of what each column leaves out, relative to the column.
 
     Parameters
     ----------
@@ -466,10 +467,35 @@ def _write_tangent(
     v = [moving(layout.v + i, n + i) for i in range(n)]
     h = dual.DualNumber(builder.load(at(layout.status + 1)))
     step.expand(t, inputs, q, v, h, order)
+    columns_of = [number.slopes for number in (*q, *v)]
     q, v = step.advance(t, q, h, order)
+    columns_of += [number.slopes for number in (*q, *v)]
     for i, number in enumerate([*q, *v]):
         builder.store(number.value, at(layout.q + i))
         builder.store(wide.number(0.0) if number.slopes is None else number.slopes, slopes(i)).align = 8
+
+    def largest(numbers: Sequence, least: float) -> Any:
+        total = wide.number(least)
+        for x in numbers:
+            total = wide.select(wide.less(total, wide.abs(x)), wide.abs(x), total)
+        return total
+
+    def terms(first: int) -> Any:
+        """Return the size of two neighbouring terms; there may be only odd or only even ones."""
+        orders = plain.plus(order, first), plain.plus(order, first - 1)
+        return largest(
+            [wide.add(*(wide.abs(wide.load(step.slot_of["v", i], k)) for k in orders)) for i in range(n)],
+            1e-300,
+        )
+
+    # What follows the last terms, if it shrinks like these.
+    last = terms(0)
+    shrinking = wide.div(last, terms(-2))
+    most = wide.number(0.9)
+    shrinking = wide.select(wide.less(shrinking, most), shrinking, most)
+    rest = wide.div(wide.mul(last, shrinking), wide.sub(wide.number(1.0), shrinking))
+    size = largest([x for x in columns_of if x is not None], 1e-280)
+    builder.store(wide.div(rest, size), slopes(2 * n)).align = 8
     builder.ret_void()
     return function
 
@@ -478,8 +504,9 @@ def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> 
     """Return ``pull(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
 
     Rows are `BLOCK` numbers apart: those of `LaneLayout` up to `wish`, then cotangents of places and
-    velocities after the substep, and of the sources. All but the inputs are replaced. It returns 1 if the
-    lanes that ended their step went backwards, see `Backward.pull`.
+    velocities after the substep, and of the sources, and an estimate of what they leave out, relative to
+    them. All but the inputs are replaced. It returns 1 if the lanes that ended their step went backwards, see
+    `Backward.pull`.
 
     Parameters
     ----------
