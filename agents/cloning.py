@@ -118,6 +118,10 @@ class Learner:
             (self.actor(seen[batch]) - wanted[batch]).square().mean().backward()
             self.adam.step()
 
+    def weights(self) -> list[torch.nn.Parameter]:
+        """Return everything that is learned."""
+        return list(self.actor.parameters())
+
     def state(self) -> dict[str, Any]:
         """Return everything that changes, for a checkpoint."""
         names = ("trained", "rng", "observation", "holds", "begun", "seen", "wanted")

@@ -21,7 +21,7 @@ import numpy as np
 
 from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparameters
 from agents.run import RESULT, Run, UserError, check_numbers, fresh_seeds, known_name, own_env, reports_errors
-from agents.train import command, here, show_progress
+from agents.train import here, report_failures, show_progress
 from lag_envs.evaluation.rollout import play
 from lag_envs.options import module_parser
 from lag_envs.scores import known_returns, score
@@ -81,11 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not finished:
         print("Loading PyTorch and compiling the environment (kept for the next time) ...", flush=True)
         failed, stopped = show_progress([run], here)
-        for reason in failed.values():
-            print(f"agents.demo: error: {reason}", file=sys.stderr)
         if stopped or failed:
-            print(f"To resume: {command('agents.demo', arguments)}")
-            return 130 if stopped else 1
+            return report_failures(failed, stopped, "agents.demo", arguments)
     report(run, video=not args.no_video)
     return 0
 

@@ -5,13 +5,14 @@ Learners with their own files are called from here too, so that commands can tre
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import math
 import pickle
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from importlib import import_module
 from importlib.metadata import version
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter
 
 import lag_envs.hyperparams
 from agents.run import (
@@ -35,6 +37,7 @@ from agents.run import (
     read_result,
 )
 from lag_envs import __version__
+from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
 from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
@@ -69,6 +72,16 @@ TEST_EPISODES, EPISODES = 20, 100
 TESTS = 16
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 SCALE = "lag_envs.sb3.ScaledReward"
+#: The argument of each wrapper that is known.
+WRAPPERS = {TIME_LIMIT: "max_episode_steps", DISCRETISE: "bins", SCALE: "factor"}
+#: The Zoo's hyperparameters that are not arguments of a learner's class; with their types, if numbers.
+ZOO: Mapping[str, type | None] = dict.fromkeys(
+    ("n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs", "noise_type")
+) | {"n_envs": int, "noise_std": float, "frame_stack": int}
+#: Arguments of a learner's class that are no hyperparameters.
+GIVEN = ("env", "seed", "device", "tensorboard_log", "action_noise", "_init_setup_model")
+#: A training with a larger weight has diverged.
+LARGEST_WEIGHT = 1e6
 #: Libraries whose versions are stored in a result.
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
 
@@ -108,12 +121,40 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
         entries = yaml.safe_load(file.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise UserError(f"{file} cannot be read: {error}") from error
-    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
-        raise UserError(f"{file} has no entry for {env_id}; add one in the form of the others")
+    form = f"`lag-envs hyperparams {algo}` prints the form"
+    if not isinstance(entries, dict):
+        raise UserError(f"{file} must map ids to hyperparameters, it is a {type(entries).__name__}; {form}")
+    if env_id not in entries:
+        raise UserError(f"{file} has no entry for {env_id}, only for {', '.join(map(str, entries))}; {form}")
     entry = entries[env_id]
-    if "n_timesteps" not in entry:
-        raise UserError(f"{file}: the entry for {env_id} lacks n_timesteps")
+    if not isinstance(entry, dict):
+        raise UserError(f"{file}: the entry for {env_id} must map names to values, got {entry!r:.60}; {form}")
+    try:
+        check_hyperparameters(algo, entry)
+    except UserError as error:
+        raise UserError(f"{file}, entry {env_id}: {error}") from error
     return entry
+
+
+def check_hyperparameters(algo: str, hyperparameters: Mapping[str, Any]) -> None:
+    """Raise a UserError for a missing or unknown hyperparameter, or one of another type."""
+    if algo in OWN:
+        import_module(OWN[algo][0]).Settings.of(hyperparameters)
+        return
+    arguments = inspect.signature(learner(algo)).parameters
+    known = {name: a.annotation for name, a in arguments.items() if name not in GIVEN} | ZOO
+    for name, value in hyperparameters.items():
+        if name not in known:
+            raise UserError(f"{algo} has no hyperparameter {name!r}; {hint(str(name), known)}")
+        if (kind := known[name]) in (bool, int, float) or name == "policy":
+            strict = ConfigDict(strict=True, allow_inf_nan=False)
+            try:
+                checked(TypeAdapter(str if name == "policy" else kind, config=strict), value)
+            except ValueError as error:
+                raise UserError(f"{name}: {error}") from error
+    for name in ("n_timesteps", "policy"):
+        if name not in hyperparameters:
+            raise UserError(f"{name} is missing; `lag-envs hyperparams {algo}` prints complete entries")
 
 
 def suits(algo: str, task: Task) -> bool:
@@ -136,6 +177,10 @@ class LearnerSettings(Strict):
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Any]) -> Self:
         """Return settings by name, or raise a UserError that names the wrong one."""
+        for name in hyperparameters:
+            if name not in cls.model_fields:
+                meant = hint(str(name), cls.model_fields)
+                raise UserError(f"settings of {cls.learner}: {name} is an unknown key; {meant}")
         try:
             return checked(cls, dict(hyperparameters))
         except ValueError as error:
@@ -176,17 +221,17 @@ def make_envs(run: Run, normalise: Any = None) -> Any:
     bins = factor = None
     for wrapper in [*hyper.get("env_wrapper", []), *hyper.get("vec_env_wrapper", [])]:
         name, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
-        if name in (TIME_LIMIT, DISCRETISE, SCALE) and not arguments:
-            raise UserError(f"wrapper {name} needs its arguments, as in {name}: {{...}}")
+        if name not in WRAPPERS:
+            raise UserError(f"wrapper {name} is not known here; {', '.join(WRAPPERS)} are")
+        if not isinstance(arguments, dict) or list(arguments) != [WRAPPERS[name]]:
+            raise UserError(f"wrapper {name} needs its argument, as in {name}: {{{WRAPPERS[name]}: ...}}")
+        (value,) = arguments.values()
         if name == TIME_LIMIT:
-            options["max_episode_steps"] = arguments["max_episode_steps"]
-            steps = min(steps, options["max_episode_steps"])
+            options["max_episode_steps"], steps = value, min(steps, value)
         elif name == DISCRETISE:
-            bins = arguments["bins"]
-        elif name == SCALE:
-            factor = arguments["factor"]
+            bins = value
         else:
-            raise UserError(f"wrapper {name} is not known here; {TIME_LIMIT}, {DISCRETISE} and {SCALE} are")
+            factor = value
     if steps == math.inf:
         raise UserError(f"the episodes of {run.env} have no end; give it a duration, or a TimeLimit to train")
     if bins and (task.formulas.choices or task.formulas.actions > 1):
@@ -216,10 +261,8 @@ def make_model(run: Run, envs: Any) -> Any:
 
     # The networks are too small for several threads: a second one costs more than it gains.
     torch.set_num_threads(1)
-    own = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs")
-    own += ("noise_type", "noise_std", "frame_stack")
     # A copy, for learners write into what they are given.
-    arguments = deepcopy({k: v for k, v in run.hyperparameters.items() if k not in own})
+    arguments = deepcopy({k: v for k, v in run.hyperparameters.items() if k not in ZOO})
     for name in ("learning_rate", "clip_range"):
         if isinstance(arguments.get(name), str):  # "lin_3e-4" falls to zero in the course of the training
             try:
@@ -305,6 +348,7 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
     from stable_baselines3.common.logger import Logger
 
     content = run.load_checkpoint()
+    check_hyperparameters(run.algo, run.hyperparameters)
     model = make_model(run, make_envs(run)) if content is None else thaw(run, content)
     best = content and content["best"]
     model.get_env().reset()  # compiles
@@ -333,6 +377,7 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             """Test the current policy and save everything; this does not count as training."""
             nonlocal best
             run.stop_clock()
+            check_weights(run, self.model.policy.parameters())
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
             normalise = self.model.get_vec_normalize_env()
@@ -351,12 +396,22 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
         model.set_logger(Logger(None, []))
     if run.trained < run.steps:
         run.start_clock()
-        # The learner adds its earlier steps to the number of steps it is given.
-        model.learn(
-            run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
-        )
+        left = run.steps - run.trained  # the learner adds its earlier steps
+        try:
+            model.learn(left, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10)
+        except Exception as error:
+            check_weights(run, model.policy.parameters(), error)
+            raise
         watch.keep()
     finish_training(run, best)
+
+
+def check_weights(run: Run, weights: Iterable[Any], error: Exception | None = None) -> None:
+    """Raise a UserError, from what this led to, if a tensor of weights shows that a training diverged."""
+    if not all((w.detach().abs() < LARGEST_WEIGHT).all() for w in weights):
+        raise UserError(
+            f"the training diverged (seed {run.seed}, after {run.trained:,} steps): lower learning_rate"
+        ) from error
 
 
 def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
@@ -382,9 +437,14 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
         test()
     while learner.trained < run.steps:
         run.start_clock()
-        learner.iterate()
+        try:
+            learner.iterate()
+        except Exception as error:
+            check_weights(run, learner.weights(), error)
+            raise
         run.stop_clock()
         run.trained = learner.trained
+        check_weights(run, learner.weights())
         show(run)
         if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
             test()

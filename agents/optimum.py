@@ -224,6 +224,9 @@ class Solution:
             Targets, where the task has them.
         """
         times = np.ascontiguousarray(np.broadcast_to(times, len(points)), np.int64)
+        last = len(self.values[0]) - 1
+        if ((times < 0) | (times > last)).any():
+            raise ValueError(f"times must lie between 0 and {last}, got {times.min()} to {times.max()}")
         if targets is None:
             return self._at(0, times, points)
         points = np.where(targets < 0.0, -1.0, 1.0)[:, None] * points  # the mirror image

@@ -35,7 +35,7 @@ from torch import Tensor, nn
 import agents
 from agents.learners import LearnerSettings, trainable
 from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
-from agents.train import command, here, planned_runs, print_returns, show_progress
+from agents.train import here, planned_runs, print_returns, report_failures, show_progress
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
 from lag_envs.leaderboard.networks import stacked
@@ -368,6 +368,10 @@ class Learner:
                 self.gradient.mul_((s.max_grad_norm / (self.gradient.norm() + 1e-6)).clamp(max=1.0))
                 self.adam.step()
 
+    def weights(self) -> list[nn.Parameter]:
+        """Return everything that is learned."""
+        return [self.parameters]
+
     def state(self) -> dict[str, Any]:
         """Return everything that changes, for a checkpoint."""
         return {
@@ -417,8 +421,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seeds", type=int, default=1, metavar="N", help="how many, in turn (default 1)")
     p.add_argument("--first-seed", type=int, default=0, metavar="K", help="the first one (default 0)")
     p.add_argument(
-        "--steps", type=int, metavar="N", help="environment steps per seed (default: the task's own)"
-    )
+        "--steps", type=int, metavar="N",
+        help="environment steps per seed, rounded up to whole updates (default: the task's own)",
+    )  # fmt: skip
     p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
     p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
     group = p.add_argument_group(
@@ -453,11 +458,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     todo = [run for run in runs if run.load_result() is None]
     failed, stopped = show_progress(todo, here) if todo else ({}, False)
     print_returns([run for run in runs if run.name not in failed])
-    for name, reason in failed.items():
-        print(f"{name} failed: {reason}", file=sys.stderr)
     if stopped or failed:
-        print(f"To resume: {command('agents.ppo', arguments)}")
-        return 130 if stopped else 1
+        return report_failures(failed, stopped, "agents.ppo", arguments)
     print(
         f"Since the command began, with imports, compiling, tests and evaluation: "
         f"{time.perf_counter() - agents.STARTED:.1f} s, {time.process_time():.1f} s of them on the processor"

@@ -36,6 +36,7 @@ from lag_envs import TASKS, store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
 from lag_envs.options import module_parser, new_file, new_picture
+from lag_envs.own_files import is_file
 from lag_envs.scores import known_returns, score
 from lag_envs.tables import aligned
 
@@ -79,7 +80,10 @@ def parser() -> argparse.ArgumentParser:
     p = module_parser(
         "agents.race", "Train learners side by side, and report when each reaches which score.", EPILOG
     )
-    p.add_argument("env", nargs="?", default=ENV, metavar="ENV", help="default %(default)s")
+    p.add_argument(
+        "env", nargs="?", default=ENV, metavar="ENV",
+        help="an id of the package: only these have a scale of scores (default %(default)s)",
+    )  # fmt: skip
     p.add_argument(
         "--learners", nargs="+", default=["fast_ppo", "ppo"], metavar="NAME",
         help=f"of {', '.join(LEARNERS)} (default fast_ppo ppo)",
@@ -98,6 +102,11 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
+    if is_file(args.env) or ":" in args.env:
+        raise UserError(
+            f"a race is on ids of the package, which have a scale of scores, got {args.env}; agents.train "
+            "trains on tasks of your own"
+        )
     task = TASKS[check_env(args.env)]()
     if known_returns(args.env) is None:
         raise UserError(f"{args.env} has no scale of scores yet; python -m agents.scale measures one")
@@ -148,7 +157,10 @@ def trainings(args: argparse.Namespace, names: Sequence[str]) -> Iterator[dict[s
 
 
 def earlier_rows(file: Path) -> list[dict[str, Any]]:
-    """Return the trainings that a file holds, or raise a UserError if there is anything else in it."""
+    """Return the trainings that a file holds, or raise a UserError if it holds others' rows.
+
+    Lines that are no rows, such as one that was cut off, are named and left out.
+    """
     found = list(store.rows(file))
     refuse = f"{file} is not a file of a race ({{}}); choose another --output, or remove it"
     if not found and file.exists() and file.read_bytes().strip():
@@ -160,6 +172,10 @@ def earlier_rows(file: Path) -> list[dict[str, Any]]:
             first = error.errors()[0]
             what = " ".join(map(str, (*first["loc"], first["msg"])))
             raise UserError(refuse.format(f"row {number}: {what}")) from error
+    lines = sum(bool(line.strip()) for line in file.read_bytes().splitlines()) if file.exists() else 0
+    if left := lines - len(found):
+        what = "1 line that is" if left == 1 else f"{left} lines that are"
+        print(f"{file}: {what} no JSON left out; a row that was cut off is trained again", file=sys.stderr)
     return found
 
 

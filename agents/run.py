@@ -266,12 +266,12 @@ def check_writable(file: Path) -> None:
 
 
 def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Let a command's function show its errors in a line and obey SIGTERM, see `run_shown`."""
+    """Let the function of ``python -m PROGRAM`` show errors in a line and obey SIGTERM, see `run_shown`."""
 
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)
         def run(arguments: Sequence[str] | None = None) -> int:
-            return run_shown(program, lambda: main(arguments))
+            return run_shown(f"python -m {program}", lambda: main(arguments))
 
         return run
 

@@ -281,6 +281,10 @@ class Learner:
                 off.square().mean().backward()
                 self.adams[1].step()
 
+    def weights(self) -> list[nn.Parameter]:
+        """Return everything that is learned."""
+        return [*self.actor.parameters(), *self.critic.parameters()]
+
     def state(self) -> dict[str, Any]:
         """Return everything that changes, for a checkpoint."""
         return {

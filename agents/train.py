@@ -22,7 +22,7 @@ from functools import partial
 from itertools import groupby, product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from agents.learners import EPISODES, LEARNERS, TESTS, suits, train_rest, zoo_hyperparameters
 from agents.run import (
@@ -88,7 +88,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
     )
-    p.add_argument("--steps", type=int, help="environment steps per seed, in place of n_timesteps")
+    p.add_argument(
+        "--steps", type=int,
+        help="environment steps per seed, in place of n_timesteps; rounded up to whole updates",
+    )  # fmt: skip
     p.add_argument(
         "--jobs", type=int, metavar="N", help="seeds trained at once (default: the number of cores)"
     )
@@ -119,11 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
     print_returns([run for run in runs if run.name not in failed])
-    for name, reason in failed.items():
-        print(f"{name} failed: {reason}", file=sys.stderr)
-    if stopped or failed:
-        print(f"To resume: {command('agents.train', arguments)}")
-    return 130 if stopped else 1 if failed else 0
+    return report_failures(failed, stopped, "agents.train", arguments)
 
 
 def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:
@@ -168,8 +167,23 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
 # --- one seed, in a process or on another machine -----------------------------------------------------------
 
 
-def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
-    """Train one run and report its progress; return why it failed, or nothing on success.
+class Failure(NamedTuple):
+    """A run's failure.
+
+    Attributes
+    ----------
+    reason : str
+        What to tell.
+    passing : bool
+        Whether the same command may succeed later, as after a full disk.
+    """
+
+    reason: str
+    passing: bool = False
+
+
+def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> Failure | None:
+    """Train one run and report its progress; return why it failed, or None on success.
 
     Parameters
     ----------
@@ -203,12 +217,13 @@ def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> st
         train_rest(run, show=show, tested=tested)
         send(MODEL, NORMALISATION, RESULT)
     except UserError as error:
-        return str(error)
+        return Failure(str(error))
     except OSError as error:
-        return f"{error}; what was saved before is kept" if run.path(CHECKPOINT).exists() else str(error)
+        kept = "; what was saved before is kept" if run.path(CHECKPOINT).exists() else ""
+        return Failure(f"{error}{kept}", passing=True)
     except Exception:
-        return traceback.format_exc()
-    return ""
+        return Failure(traceback.format_exc())
+    return None
 
 
 _events: Any = None
@@ -219,12 +234,12 @@ def _begin(events: Any) -> None:
     _events = events
 
 
-def _here(run: Run) -> str:
+def _here(run: Run) -> Failure | None:
     """Work in a process of its own."""
     return train_run(run, _events.put)
 
 
-def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> str:
+def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> Failure | None:
     """Work on a machine that does not see the run's folder."""
     with tempfile.TemporaryDirectory() as folder:
         run = Run(**settings | {"folder": Path(folder)})
@@ -278,7 +293,7 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
 
 
 def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
-    """Return the next event, or ("end", name, reason), or None; write the files that events bring."""
+    """Return the next event, or ("end", name, failure), or None; write the files that events bring."""
     ended = next((future for future in futures if future.done()), None)
     try:
         event = events.get(timeout=0.05 if ended else 0.2)
@@ -286,7 +301,7 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
         if ended is None:
             return None
         run, error = futures.pop(ended), ended.exception()
-        return "end", run.name, ended.result() if error is None else died(error)
+        return "end", run.name, ended.result() if error is None else Failure(died(error), passing=True)
     if event[0] == "file":
         write_file(next(run for run in futures.values() if run.name == event[1]).path(event[2]), event[3])
         return None
@@ -296,11 +311,11 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
 # --- progress -----------------------------------------------------------------------------------------------
 
 
-def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str], bool]:
+def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, Failure], bool]:
     """Train the runs and show their progress; return the failures, and whether it was stopped."""
     from tqdm import tqdm
 
-    failed: dict[str, str] = {}
+    failed: dict[str, Failure] = {}
     left = {run.name: run for run in runs}
     steps = {run.name: run.trained for run in runs}
     bar = tqdm(
@@ -363,6 +378,17 @@ def print_returns(runs: Sequence[Run]) -> None:
             rows.append((str(run.seed), f"{trained:,}", f"{seconds:.1f}", f"{mean:.2f}", tail))
         print("\n".join(aligned(rows)))
         print(f"Written to {results[0][0].folder.parent}/")
+
+
+def report_failures(
+    failed: Mapping[str, Failure], stopped: bool, module: str, arguments: Sequence[str] | None
+) -> int:
+    """Print why runs failed, and how to resume where that may help; return the command's exit status."""
+    for name, failure in failed.items():
+        print(f"{name} failed: {failure.reason}", file=sys.stderr)
+    if stopped or any(failure.passing for failure in failed.values()):
+        print(f"To resume: {command(module, arguments)}")
+    return 130 if stopped else 1 if failed else 0
 
 
 def command(module: str, arguments: Sequence[str] | None) -> str:

@@ -109,6 +109,8 @@ class Grid:
 
     def interpolate(self, values: NDArray[np.float32], coordinates: Array) -> Array:
         """Return values given at the nodes, (*shape,), interpolated at coordinates (n, d)."""
+        if values.shape != self.shape:
+            raise ValueError(f"values must have the shape of the grid, {self.shape}, got {values.shape}")
         cells, places = self.locate(coordinates)
         return interpolate_rows(
             values.reshape(1, -1), np.zeros(len(cells), np.int64), cells, places, self.strides

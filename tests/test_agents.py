@@ -203,7 +203,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path, monkeypatch):
 )
 def test_demo_says_what_is_wrong(arguments, message, demonstrate):
     status, output = demonstrate(*arguments)
-    assert status == 2 and message in output and output.startswith("agents.demo: error:")
+    assert status == 2 and message in output and output.startswith("python -m agents.demo: error:")
 
 
 def test_demo_leaves_folders_of_others_alone(demonstrate, tmp_path):

@@ -282,5 +282,14 @@ def test_shapes_of_gradients():
     with pytest.raises(ValueError, match="cotangent must be finite, got nan"):
         bar.vjp(np.zeros(4), 0.0, 0.02, [0.0, math.nan, 0.0, 0.0])
     for scene in (bar, CartPole()):
-        A, B = scene.jacobian(np.zeros((0, 4)), np.zeros((0, 1)), 0.02)
-        assert A.shape == (0, 4, 4) and B.shape == (0, 4, 1)
+        for state, control in (((0, 4), (0, 1)), ((0, 4), 0), (4, (0, 1))):
+            A, B = scene.jacobian(np.zeros(state), np.zeros(control), 0.02)
+            assert A.shape == (0, 4, 4) and B.shape == (0, 4, 1)
+        with pytest.raises(ValueError, match=rf"the control must be \({scene.control_names[0]}\), 1 in all"):
+            scene.jacobian(np.zeros(4), [], 0.02)
+        with pytest.raises(ValueError, match=r"the control must be finite, got inf$"):
+            scene.jacobian(np.zeros(4), np.inf, 0.02)
+    # The step is taken, only the gradient overflows.
+    large = [[0.0] * 4, [1e308] * 4]
+    with pytest.raises(ValueError, match=r"the gradient of row 1 .* \[1e\+308, .*\] is too large; scale it"):
+        bar.vjp([[0.0, 0.0, 3.0, 0.1]] * 2, 0.1, 0.02, large)

@@ -1,8 +1,10 @@
 """Parameters from independent recordings: by SciPy's DOP853 on hand-written equations."""
 
 import math
+import re
 import warnings
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
 from lag_envs.scenes import CartPole, Chain, Pendulum, Scene, StepRefused, parameter
+from lag_envs.scenes.fitting import fit
 from lag_envs.scenes.fitting.parameters import FreeParameters
+from lag_envs.scenes.fitting.recordings import doubtful_units, recordings_of
 from lag_envs.scenes.fitting.result import FitWarning
 from tools.docs import fit as docs
 
@@ -339,8 +343,44 @@ def test_a_model_that_does_not_follow():
     with pytest.warns(FitWarning) as seen:
         Pendulum(damping=0.05).fit([(noisy(states, 0.01, 1), torques, DT)], ["length"])
     texts = [str(w.message) for w in seen]
-    assert any("does not follow theta: it is off by" in text for text in texts)
+    words = r"does not follow theta: it is off by \S+ rad, where short pieces of it are off by \S+ rad; some"
+    assert any(re.search(words, text) for text in texts)
     assert any("residuals of theta are not independent" in text for text in texts)
+
+
+def test_what_was_misread():
+    states, torques = swings()
+    data = noisy(states, 0.01, 1)
+    data[:, 1] = np.nan
+    data[[30, 77], 0] += [0.5, -0.3]
+    with pytest.warns(FitWarning, match="2 values of theta may be misread"):
+        found = Pendulum(mass=ROD["mass"]).fit([(data, torques, DT)], ["length", "damping"])
+    (text,) = found.warnings
+    assert f"the largest, 0.48 rad, at {30 * DT:.4g} s. If so, give NaN there" in text
+    data[[30, 77], 0] = np.nan
+    assert found.scene.fit([(data, torques, DT)], ["length", "damping"]).warnings == ()
+
+
+def test_degrees():
+    scene = Pendulum()
+    angles = np.degrees(2.0 + np.cos(0.3 * np.arange(100)))
+    given = [(np.stack([a, np.full(100, np.nan)], axis=1), None, 0.02) for a in (angles, np.radians(angles))]
+    found = [doubtful_units(scene, recordings_of(scene, [one])) for one in given]
+    told = "theta spans 18.2 turns in a recording; if it was measured in degrees, use np.radians"
+    assert found == [[told], []]
+    # They are told before the search, even if that fails.
+    with pytest.warns(FitWarning, match="theta spans"), pytest.raises(ValueError, match="too few"):
+        scene.fit([(given[0][0][:3], None, 0.02)], ["length"])
+
+
+def test_without_bound():
+    sought = FreeParameters(Pendulum(), ("length", "damping"))
+    estimates, errors = {"length": 0.5, "damping": 4e6}, {"length": 0.1, "damping": 1e10}
+    fitted = SimpleNamespace(estimates=estimates, errors=errors, correlation=np.eye(2))
+    for converged, told in ((False, "damping=4e+06 grew without bound"), (True, "end of its range")):
+        best = sought.scaled([0.5, 4e6]), np.array([0.2, 1e10])
+        (text,) = fit._doubts_of_parameters(fitted, sought, *best, converged)
+        assert told in text
 
 
 # --- display ---
@@ -371,7 +411,13 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
     ("recordings", "keywords", "message"),
     [
         ([], {}, "recordings must be a list of .states, controls, dt."),
-        ([(STATES, None)], {}, r"recording 0 must be \(states, controls, dt\)"),
+        ([(STATES, None)], {}, r"recording 0 must be \(states, controls, dt\), got a tuple of 2$"),
+        ([{"states": STATES}], {}, "got a dict$"),
+        (STATES, {}, r"at least one, got an array of shape \(20, 2\)$"),
+        ([(np.ma.masked_invalid(STATES), None, DT)], {}, r"got a masked array; call filled\(np.nan\)$"),
+        ([([[1.0, None]] * 9, None, DT)], {}, r"a list of 9; np.array\(states, float\) makes NaN of None"),
+        ([(STATES.astype(object), None, DT)], {}, "got an array of type object; np.array"),
+        ([(STATES + 0j, None, DT)], {}, "NaN for what was not measured, got an array of type complex128$"),
         ((STATES, None, DT), {}, r"a list of \(states, controls, dt\), got one; put it into a list$"),
         ([(STATES[:, :1], None, DT)], {}, r"recording 0: states must have shape \(N, 2\), .* got \(20, 1\)"),
         ([(STATES[:1], None, DT)], {}, "at least two states, got 1"),

@@ -58,6 +58,29 @@ def test_bad_input_is_named():
     ):
         with pytest.raises(ValueError, match=message):
             model(*arguments)
+    for wrong, message in (
+        ([[0.0, 0.0]], r"states must have shape \(n, 3\), got \(1, 2\)"),
+        ([0.0, 0.0, 0.0], r"states must have shape \(n, 3\), got \(3,\)"),
+        ([[0.0, 0.0, np.nan]], "states must be finite, got .* in row 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.observe(wrong, 0.1)
+        with pytest.raises(ValueError, match=message):
+            model.kicked(wrong, np.zeros((0, 1)))
+    with pytest.raises(ValueError, match=r"targets must be finite, got \[nan\] in row 0"):
+        model.observe(state, np.nan)
+    with pytest.raises(ValueError, match=r"draws must have shape \(0, 2\), got \(1, 2\)"):
+        model.kicked(state, np.zeros((1, 2)))
+    for given, message in (
+        ({"ends": np.zeros((2, 1))}, r"ends must have shape \(2, 3\), got \(2, 1\)"),
+        ({"ends": np.full((2, 3), np.inf)}, "ends must be finite, got .* in row 0"),
+        ({"by_rewards": np.nan}, "by_rewards must be finite, got nan"),
+        ({"by_states": [[0.0] * 3, [0.0, 0.0, np.inf]]}, "by_states must be finite, got .* in row 1"),
+        ({"by_observations": np.zeros((2, 1))}, "by_observations must be one number or have shape"),
+        ({"kicks": -np.inf}, "kicks must be finite, got -inf"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.vjp(state, [0.0, 0.0], 0.1, **given)
     with pytest.raises(ValueError, match="has no target"):
         Model(make("PivotedBar-v0").task)(np.zeros((1, 4)), [0.0], 0.1)
     with pytest.raises(StepRefused, match="row 1"):

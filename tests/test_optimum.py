@@ -53,6 +53,8 @@ def test_interpolation_is_exact_for_multilinear_functions():
         np.testing.assert_array_equal(grid.interpolate(values, grid.points()), values.ravel())
         corner = np.array([[axis[-1] + 1.0 for axis in axes]])
         assert grid.interpolate(values, corner) == values[(-1,) * d]
+        with pytest.raises(ValueError, match="values must have the shape of the grid"):
+            grid.interpolate(values[1:], points)
 
 
 def test_interpolation_goes_round():
@@ -332,6 +334,8 @@ def test_between_targets_values_are_interpolated():
     expected = 0.5 * (solution.values[1][0, i, j, k] + solution.values[2][0, i, j, k])
     assert solution.value(0, middle, np.array([between]))[0] == pytest.approx(expected, rel=1e-6)
     assert solution.value(0, -middle, np.array([-between]))[0] == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(ValueError, match=r"times must lie between 0 and [0-9]+, got -1 to -1"):
+        solution.value(-1, at_node)
 
 
 # --- the command ---

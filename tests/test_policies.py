@@ -191,6 +191,8 @@ def test_frames_are_the_last_observations(padding):
         stacked = np.concatenate(padded[i : i + 3], axis=1)
         wanted = np.tanh(affine(stacked, arrays["weight_0"].T.copy(), arrays["bias_0"]))
         assert np.array_equal(actions, wanted.astype(np.float32))
+    with pytest.raises(ValueError, match=rf"takes rows of {stacked.shape[1]} numbers, got shape \(2, 3\)"):
+        acting.predict(np.zeros((2, 1)))  # compiled code would read other numbers
 
 
 def test_a_plan_is_followed_and_held():

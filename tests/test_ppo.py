@@ -358,7 +358,7 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
         ),
         ([ENV, "--frames", "0"], "frames: Input should be greater than or equal to 1, got 0"),
         ([ENV, "--actor", "0"], "actor.0: Input should be greater than 0, got 0"),
-        ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = "),
+        ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = 6144, got 1000\n"),
     ],
 )
 def test_mistakes_are_named(given, message, tmp_path, capsys):
@@ -369,7 +369,7 @@ def test_mistakes_are_named(given, message, tmp_path, capsys):
 def test_settings_of_another_kind_are_refused():
     good = zoo_hyperparameters(ppo.NAME, ENV)
     for changes, message in (
-        ({"gama": 0.9}, "gama is an unknown key"),
+        ({"gama": 0.9}, "gama is an unknown key; did you mean gamma"),
         ({"state_noise": 1}, "state_noise: Input should be a valid boolean, got 1"),
         ({"n_steps": 2.5}, "n_steps: Input should be a valid integer, got 2.5"),
         ({"actor": 32}, "actor: Input should be a valid list, got 32"),

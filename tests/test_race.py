@@ -149,6 +149,11 @@ def test_mistakes_are_named_before_the_work(arguments, message, command, monkeyp
     assert status == 2 and message in output and output.count("\n") == 1
 
 
+def test_a_file_of_ones_own_has_no_scale(capsys):
+    assert race.main(["mine.py"]) == 2
+    assert "which have a scale of scores, got mine.py; agents.train trains" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["shac", "cloning", "sac"])
 def test_discrete_actions_do_not_suit_every_learner(name, capsys):
     assert race.main([cart_pole.CartPoleExact.id, "--learners", name]) == 2
@@ -178,7 +183,8 @@ def test_a_row_that_was_cut_off_is_trained_again(command, tmp_path):
     assert command(*given, "--output", str(file))[0] == 0
     first, second = file.read_text().splitlines()
     file.write_text(first + "\n" + second[:40])
-    assert command(*given, "--output", str(file))[0] == 0
+    status, output = command(*given, "--output", str(file))
+    assert status == 0 and "race.jsonl: 1 line that is no JSON left out" in output
     rows = file.read_text().splitlines()
     assert rows[0] == first and json.loads(rows[2])["seed"] == 3
 

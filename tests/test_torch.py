@@ -157,6 +157,49 @@ def test_gradient_by_the_start():
         envs.reset(options={"state": 2.0 * start})
 
 
+@pytest.mark.parametrize(
+    "way", ["set_state", "masked", "envs.set_state", "envs.reset", "envs.step", "in place"]
+)
+@pytest.mark.parametrize("history", [False, True])
+def test_gradients_are_those_at_the_environments_state(way, history):
+    envs, start = TorchVectorEnv(IDS[0], 2), np.array([[0.0, 0.0, 3.0, 0.1], [0.0, 0.0, 0.1, 0.0]])
+    envs.reset(options={"state": start})
+    snapshot, push = envs.get_state(), torch.full((2, 1), 0.3, requires_grad=True)
+    for _ in range(10):
+        envs.step(push if history else push.detach())
+    own = way in ("set_state", "masked")
+    if own:
+        envs.set_state(snapshot, torch.tensor([True, way == "set_state"]))
+    elif way == "envs.set_state":
+        envs.envs.set_state(snapshot)
+    elif way == "envs.reset":
+        envs.envs.reset(options={"state": start})
+    elif way == "envs.step":
+        envs.envs.step(np.zeros((2, 1), np.float32))
+    else:
+        envs.state.detach().mul_(2.0)
+    if history and not own:
+        with pytest.raises(RuntimeError, match=r"call detach\(\) to continue"):
+            envs.step(push)
+        envs.detach()
+    now = envs.envs.state
+    np.testing.assert_array_equal(envs.state.detach().numpy(), now)
+    action = torch.full((2, 1), 0.5, requires_grad=True)
+    reward = envs.step(action)[1]
+    slope, before = torch.autograd.grad(reward.sum(), (action, push), allow_unused=True)
+    expected = Model(TASKS[IDS[0]]()).vjp(now, [0.5, 0.5], by_rewards=1.0).actions
+    np.testing.assert_allclose(slope[:, 0].numpy(), expected, rtol=1e-6)
+    # What was set has no history, and the rest of a batch keeps its own.
+    assert (before is None) == (not own or not history)
+    assert before is None or (before.tolist()[0] == [0.0] and (before[1] != 0.0) == (way == "masked"))
+
+
+def test_states_cannot_be_assigned():
+    envs = TorchVectorEnv(IDS[0], 2)
+    with pytest.raises(AttributeError, match=r"call reset\(options=\{'state': ...\}\), or set_state"):
+        envs.state = torch.zeros(2, 4)
+
+
 @pytest.mark.parametrize("state", [[0.0, 0.0, np.pi, 0.0], [0.0, 0.0, 0.0, 0.0], [0.2, 0.5, 1.0, -2.0]])
 def test_float32_at_ordinary_states(step, state):
     """Upright, hanging at rest: nothing is NaN, and all is near the float64 gradient."""
@@ -200,6 +243,8 @@ def test_errors(step):
     with pytest.raises(ValueError, match="options go with an id"):
         Step(step.task, damping=0.1)
     envs = TorchVectorEnv(IDS[0], 2)
+    with pytest.raises(TypeError, match=r"options must be a dict or None, got \[1\]"):
+        envs.reset(options=[1])
     envs.reset(seed=0)
     with pytest.raises(ValueError, match=r"actions must have shape \(2, 1\), got \(3, 1\)"):
         envs.step(torch.zeros(3, 1))

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
 import time
@@ -168,6 +169,7 @@ def test_hyperparameters_are_there_for_every_environment(algo):
         entry = zoo_hyperparameters(algo, env_id)
         assert entries[env_id] == entry  # in the Zoo's form they are the same
         assert entry["n_timesteps"] >= 1e4
+        learners.check_hyperparameters(algo, entry)
         policy = f"lag_envs.sb3_policies.{algo.upper()}" if algo in OFF_POLICY else "MlpPolicy"
         assert entry["policy"] == policy
 
@@ -189,18 +191,41 @@ def test_bins_are_gymnasiums():
 def test_learners_refuse_what_they_do_not_know(tmp_path):
     with pytest.raises(UserError, match="did you mean tqc"):
         zoo_hyperparameters("tqd", ENV)
-    with pytest.raises(UserError, match="ppo does not take the hyperparameters"):
-        go(make_run(tmp_path, nonsense=1))
-    with pytest.raises(UserError, match=r"wrapper gymnasium.wrappers.ClipReward is not known"):
-        go(make_run(tmp_path, env_wrapper=[{"gymnasium.wrappers.ClipReward": {}}]))
+    for changes, message in (
+        ({"gama": 0.9}, "ppo has no hyperparameter 'gama'; did you mean gamma"),
+        ({"env_wrapper": [{"gymnasium.wrappers.ClipReward": {}}]}, "wrapper .*ClipReward is not known"),
+        ({"env_wrapper": [{learners.TIME_LIMIT: {"steps": 3}}]}, "TimeLimit: {max_episode_steps: ...}"),
+    ):
+        with pytest.raises(UserError, match=message):
+            go(make_run(tmp_path, **changes))
+    file = tmp_path / "bad.yml"
     for text, message in (
         ("a: [", "cannot be read"),
-        ("a: 1", "no entry for"),
-        (f"{ENV}: {{}}", "lacks n_timesteps"),
+        ("[1, 2]", "map ids to hyperparameters, it is a list; `lag-envs hyperparams ppo` prints"),
+        ("a: 1", f"no entry for {ENV}, only for a"),
+        (f"{ENV}: 3", f"bad.yml: the entry for {ENV} must map names to values, got 3"),
+        (f"{ENV}: {{}}", f"bad.yml, entry {ENV}: n_timesteps is missing"),
+        (f"{ENV}: {{n_timesteps: 100}}", "policy is missing; `lag-envs hyperparams ppo` prints complete"),
+        (f"{ENV}: {{n_timestep: 100}}", "no hyperparameter 'n_timestep'; did you mean n_timesteps"),
+        (f"{ENV}: {{gamma: high}}", f"entry {ENV}: gamma: Input should be a valid number, got 'high'"),
+        (f"{ENV}: {{n_envs: 2.5}}", "n_envs: Input should be a valid integer, got 2.5"),
+        (f"{ENV}: {{policy: 1}}", "policy: Input should be a valid string, got 1"),
     ):
-        (tmp_path / "bad.yml").write_text(text)
-        with pytest.raises(UserError, match=message):
-            zoo_hyperparameters("ppo", ENV, tmp_path / "bad.yml")
+        file.write_text(text)
+        with pytest.raises(UserError, match=re.escape(message)):
+            zoo_hyperparameters("ppo", ENV, file)
+    with pytest.raises(UserError, match=r"bad.yml, entry .*: settings of fast_ppo: policy is an unknown key"):
+        zoo_hyperparameters("fast_ppo", ENV, file)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "fast_ppo"])
+def test_a_training_that_diverges_is_told_in_a_line(algo, tmp_path):
+    hyper = zoo_hyperparameters(algo, ENV) | SHORT["ppo"] | {"learning_rate": 1e9}
+    failure = train.train_run(Run(tmp_path, ENV, algo, 3, 400, hyper), lambda event: None)
+    assert not failure.passing
+    assert re.fullmatch(
+        r"the training diverged \(seed 3, after [0-9]+ steps\): lower learning_rate", failure.reason
+    )
 
 
 # --- damaged and foreign files ---
@@ -275,10 +300,11 @@ def test_a_full_disk_loses_nothing_that_was_saved(tmp_path, monkeypatch):
     events = []
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
-        reason = train.train_run(make_run(tmp_path), events.append)
+        some = train.train_run(make_run(tmp_path), events.append)
         nothing = train.train_run(make_run(tmp_path / "new"), events.append)
-    assert "No space left on device" in reason and "what was saved before is kept" in reason
-    assert "No space left on device" in nothing and "kept" not in nothing
+    assert "No space left on device" in some.reason and "what was saved before is kept" in some.reason
+    assert "No space left on device" in nothing.reason and "kept" not in nothing.reason
+    assert some.passing and nothing.passing
     assert going.path(run.CHECKPOINT).read_bytes() == saved
     assert go(make_run(tmp_path))
 
@@ -381,7 +407,7 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
 )
 def test_mistakes_are_named(arguments, message, command):
     status, output = command(*arguments)
-    assert status == 2 and message in output and output.startswith("agents.train: error:")
+    assert status == 2 and message in output and output.startswith("python -m agents.train: error:")
 
 
 @pytest.mark.parametrize(
@@ -414,6 +440,17 @@ def test_on_a_local_ray_cluster(command, config, tmp_path):
     status, _ = command(*arguments, "--new")
     assert status == 0
     assert [json.loads((f / run.RESULT).read_text())["evaluation"]["returns"] for f in here] == returns
+
+
+def test_only_what_may_succeed_later_is_resumed(capsys):
+    lasting, passing = train.Failure("no such luck"), train.Failure("a full disk", passing=True)
+    for failed, stopped, status in (({"a": lasting}, False, 1), ({"a": lasting, "b": passing}, False, 1),
+                                    ({}, True, 130)):  # fmt: skip
+        assert train.report_failures(failed, stopped, "agents.train", [ENV, "--new"]) == status
+        output = capsys.readouterr()
+        assert ("a failed: no such luck" in output.err) == ("a" in failed)
+        resumed = re.search(f"To resume: .* -m agents.train {ENV}\n", output.out)
+        assert bool(resumed) == (stopped or "b" in failed)
 
 
 def test_a_missing_ray_is_named(command, config):

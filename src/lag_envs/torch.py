@@ -33,8 +33,10 @@ except ModuleNotFoundError as error:
 
 import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.device import DeviceEnvs
+from lag_envs.envs.interface import start_options
 from lag_envs.envs.model import Model
 from lag_envs.envs.single import LagrangianEnv
+from lag_envs.envs.snapshots import Snapshot
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.tasks.base import Task
 
@@ -140,7 +142,9 @@ class TorchVectorEnv:
     On the CPU the numbers are those of the native vector environment, bit for bit, and tensors share its
     memory. If the actions, or the states that earlier actions led to, require a gradient, `step` is
     recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
-    until `detach` cuts them off. No gradient flows across an episode's end. Copies have no history.
+    until `detach` cuts them off. No gradient flows across an episode's end. Copies and snapshots have no
+    history. If `envs` itself is stepped, reset or set, `state` follows; if that breaks its history, a
+    RuntimeError says so until `detach`.
 
     On an NVIDIA GPU one kernel takes the whole step, states stay on the GPU, and there are no gradients. In
     float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
@@ -166,8 +170,6 @@ class TorchVectorEnv:
     ----------
     envs : LagrangianVectorEnv or DeviceEnvs
         The environments.
-    state : Tensor, shape (num_envs, n_state)
-        The states, on the CPU with their history.
 
     Raises
     ------
@@ -187,7 +189,7 @@ class TorchVectorEnv:
         **options: Any,
     ) -> None:
         self._model: Model | None = None
-        self.state = torch.empty(0)
+        self._state, self._moment = torch.empty(0), (0, 0, 0)
         self._infos: dict[str, Any] = {}
         if str(device) not in ("cpu", "cpu:0"):
             self.envs = found = DeviceEnvs(task, num_envs, device, dtype, **options)
@@ -213,12 +215,46 @@ class TorchVectorEnv:
         self.observation_space, self.action_space = made.observation_space, made.action_space
 
     def __getstate__(self) -> dict[str, Any]:
-        history = self.state.requires_grad
-        return vars(self) | ({"state": self.state.detach()} if history else {})
+        history = self._state.requires_grad
+        return vars(self) | ({"_state": self._state.detach()} if history else {})
 
     def _take_spaces(self, made: LagrangianVectorEnv) -> None:
         self.single_observation_space = made.single_observation_space
         self.single_action_space = made.single_action_space
+
+    @property
+    def state(self) -> Tensor:
+        """The states, shape (num_envs, n_state), on the CPU with their history.
+
+        They cannot be assigned: ``reset(options={"state": ...})`` begins with other ones.
+
+        Raises
+        ------
+        RuntimeError
+            If the environments are no longer where the history of the states leads.
+        """
+        if isinstance(self.envs, DeviceEnvs):
+            return self.envs.state
+        if self._moment == (*self.envs.moment, self._state._version):
+            return self._state
+        state, now = self._state, self.envs.state
+        if not np.array_equal(state.detach().numpy(), now):
+            if state.requires_grad:
+                raise RuntimeError(
+                    "the environments are not where the history of `state` leads: a step was refused, they "
+                    "were changed through `envs`, or `state` in place; call detach() to continue from where "
+                    "they are, and use reset and set_state of this object"
+                )
+            state = torch.from_numpy(now)
+        self._keep(state)
+        return state
+
+    @state.setter
+    def state(self, value: Any) -> NoReturn:
+        raise AttributeError(
+            "state cannot be assigned, since the environments would not follow; call "
+            "reset(options={'state': ...}), or set_state with a snapshot of get_state"
+        )
 
     @property
     def model(self) -> Model:
@@ -243,11 +279,9 @@ class TorchVectorEnv:
             Empty, or the diagnostics.
         """
         if isinstance(self.envs, DeviceEnvs):
-            seen = self.envs.reset(seed, options)
-            self.state = self.envs.state
-            return seen, {}
+            return self.envs.reset(seed, options), {}
+        state, _, mask = start_options(options, ("state", "target", "reset_mask"))
         given = dict(options or {})
-        state = given.get("state")
         if isinstance(state, Tensor):
             _check("options['state']", state, (self.num_envs, len(self.envs.scene.state_names)))
             if state.requires_grad and not state.is_leaf:
@@ -256,13 +290,47 @@ class TorchVectorEnv:
                     "lag_envs.torch.Step for gradients through it"
                 )
         plain = {k: v.detach().numpy() if isinstance(v, Tensor) else v for k, v in given.items()}
+        before = None if mask is None else self.state
         observations, infos = self.envs.reset(seed=seed, options=plain or None)
-        mask = torch.from_numpy(plain["reset_mask"])[:, None] if "reset_mask" in plain else None
         now = torch.from_numpy(self.envs.state)
         if isinstance(state, Tensor) and state.requires_grad:
-            now = state.to(torch.float64) if mask is None else torch.where(mask, state.to(torch.float64), now)
-        self.state = now if mask is None else torch.where(mask, now, self.state)
+            now = state.to(torch.float64)
+        self._keep(now if before is None else torch.where(torch.as_tensor(mask)[:, None], now, before))
         return torch.from_numpy(observations), infos
+
+    def get_state(self) -> Snapshot:
+        """Return everything that decides how these and later episodes continue, for `set_state`.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        ValueError
+            On a GPU.
+        """
+        return self._on_cpu().get_state()
+
+    def set_state(self, snapshot: Snapshot, mask: Any = None) -> None:
+        """Restore the state in which `get_state` was called; see `LagrangianVectorEnv.set_state`.
+
+        No gradient flows to what came before, in the environments that are set.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            A snapshot of this batch, or of one made alike.
+        mask : ndarray or Tensor of bool, shape (num_envs,), optional
+            The environments to set; by default all.
+
+        Raises
+        ------
+        TypeError, ValueError, ResetNeeded
+            As `LagrangianVectorEnv.set_state` does; ValueError also on a GPU.
+        """
+        envs, before = self._on_cpu(), None if mask is None else self.state
+        envs.set_state(snapshot, mask.numpy() if isinstance(mask, Tensor) else mask)
+        now = torch.from_numpy(envs.state)
+        self._keep(now if before is None else torch.where(torch.as_tensor(mask)[:, None], now, before))
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Hold one control for one control interval in every environment.
@@ -298,21 +366,36 @@ class TorchVectorEnv:
                 )
             return self.envs.step(actions)
         _check("actions", actions, (self.num_envs, self.envs.task.formulas.actions))
-        if torch.is_grad_enabled() and (actions.requires_grad or self.state.requires_grad):
-            observations, rewards, self.state, *ends = _EnvStep.apply(self, self.state, actions)
+        if torch.is_grad_enabled() and (actions.requires_grad or self._state.requires_grad):
+            observations, rewards, after, *ends = _EnvStep.apply(self, self.state, actions)
+            self._keep(after)
             return observations, rewards, *ends, self._infos
         results = [torch.from_numpy(x) for x in self._advance(actions)]
-        self.state = torch.from_numpy(self.envs.state)
+        self._keep(torch.from_numpy(self.envs.state))
         return *results, self._infos  # type: ignore[return-value]
 
     def detach(self) -> None:
         """Forget the history of the states: no gradient flows to steps before this call."""
-        self.state = self.state.detach()
+        self._state = self._state.detach()
 
     def close(self) -> None:
         """Close the environments."""
         if isinstance(self.envs, LagrangianVectorEnv):
             self.envs.close()
+
+    def _keep(self, state: Tensor) -> None:
+        """Take the present states, with their history."""
+        assert isinstance(self.envs, LagrangianVectorEnv)
+        self._state, self._moment = state, (*self.envs.moment, state._version)
+
+    def _on_cpu(self) -> LagrangianVectorEnv:
+        """Return the environments, or raise a ValueError if they are on a GPU."""
+        if isinstance(self.envs, DeviceEnvs):
+            raise ValueError(
+                "environments on a GPU have no snapshots; keep state.clone() and give it to "
+                "reset(options={'state': ...}), or make the environments with device='cpu'"
+            )
+        return self.envs
 
     def _advance(self, actions: Tensor) -> list[Any]:
         assert isinstance(self.envs, LagrangianVectorEnv)
@@ -371,18 +454,12 @@ class _RowStepBackward(torch.autograd.Function):
         by_observations: Tensor,
         by_rewards: Tensor,
     ) -> tuple[Tensor, ...]:
-        found = model.vjp(
-            *_rows(model, states, actions, targets),
-            by_states=_numbers(by_states),
-            by_observations=_numbers(by_observations),
-            by_rewards=_numbers(by_rewards),
-            ends=_numbers(ends),
-        )
-        slopes = found.states, found.actions.reshape(actions.shape), found.targets
         given = states, actions, targets
+        y, a, g, z, *seeds = map(_numbers, (*given, ends, by_states, by_observations, by_rewards))
+        slopes = model.reverse().pull(y, a, g, z, z, *seeds)
         return tuple(
             torch.from_numpy(np.ascontiguousarray(slope)).to(x.dtype)
-            for slope, x in zip(slopes, given, strict=True)
+            for slope, x in zip(slopes, given, strict=False)
         )
 
     @staticmethod

@@ -140,25 +140,37 @@ class Model:
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None
     ) -> tuple[Array, Array, Array]:
         """Return states, actions and targets as arrays of two axes, or raise a ValueError."""
-        states = np.ascontiguousarray(real_array("states", states))
-        n = len(states) if states.ndim else 0
-        if states.shape != (n, self._n_state):
-            raise ValueError(f"states must have shape (n, {self._n_state}), got {states.shape}")
+        states = self._checked_states(states)
+        n = len(states)
         targets = self._targets(targets, n)
         actions = np.ascontiguousarray(real_array("actions", actions), np.float64)
         count = self.task.formulas.actions
         wanted = (n,) if count == 1 else (n, count)
         if actions.shape != wanted:
             raise ValueError(f"actions must have shape {wanted}, got {actions.shape}")
-        for name, values in (("states", states), ("actions", actions), ("targets", targets)):
-            if not np.isfinite(values).all():
-                row = int(np.argwhere(~np.isfinite(values))[0, 0])
-                raise ValueError(f"{name} must be finite, got {values[row]} in row {row}")
-        return states, actions.reshape(n, count), targets
+        return states, _finite("actions", actions).reshape(n, count), targets
+
+    def _checked_states(self, states: ArrayLike) -> Array:
+        """Return states as an array of shape (n, n_state), or raise a ValueError."""
+        array = np.ascontiguousarray(real_array("states", states))
+        if array.ndim != 2 or array.shape[1] != self._n_state:
+            raise ValueError(f"states must have shape (n, {self._n_state}), got {np.shape(states)}")
+        return _finite("states", array)
 
     def observe(self, states: ArrayLike, targets: ArrayLike | None = None) -> Array:
-        """Return the observations of states, shape (n, n_observations)."""
-        states = real_array("states", states)
+        """Return the observations of states, shape (n, n_observations).
+
+        Parameters
+        ----------
+        states, targets : array_like
+            As for a step.
+
+        Raises
+        ------
+        ValueError
+            As for a step.
+        """
+        states = self._checked_states(states)
         return self.reverse().observations(states, self._targets(targets, len(states)))
 
     def vjp(
@@ -171,7 +183,7 @@ class Model:
         by_observations: ArrayLike = 0.0,
         by_rewards: ArrayLike = 0.0,
         parameters: Sequence[str] = (),
-        ends: Array | None = None,
+        ends: ArrayLike | None = None,
         kicks: ArrayLike = 0.0,
     ) -> Gradient:
         """Pull a gradient back through a step (vector-Jacobian product).
@@ -191,7 +203,7 @@ class Model:
             The gradient with respect to the rewards.
         parameters : sequence of str
             Parameters of the scene with respect to which the gradient is wanted.
-        ends : ndarray, shape (n, n_state), optional
+        ends : array_like, shape (n, n_state), optional
             The states after the step, before kicks, if known.
         kicks : array_like, shape (n, n_state)
             What kicks added to them, as constants.
@@ -203,7 +215,8 @@ class Model:
         Raises
         ------
         ValueError, StepRefused
-            As a step does; ValueError also for a task whose actions are choices, and for unknown parameters.
+            As a step does; ValueError also for a task whose actions are choices, for unknown parameters, and
+            for a gradient that is not finite.
         """
         reverse = self.reverse(check_parameters(self.task.scene, parameters))
         shape = np.shape(actions)
@@ -211,6 +224,7 @@ class Model:
             ends, _, _ = self(states, actions, targets)
         states, actions, targets = self._checked(states, actions, targets)
         n, observations = len(states), len(self.task.formulas.observation)
+        ends = _rows("ends", ends, states.shape, single=False)
         slopes = reverse.pull(
             states,
             actions,
@@ -300,10 +314,16 @@ class Model:
             States at a step's end.
         draws : array_like, shape (task.draws, n)
             The random numbers in [0, 1) of the kick.
+
+        Raises
+        ------
+        ValueError
+            For values that are not finite or have another shape.
         """
-        array, form = real_array("states", states), form_of(self.task.scene)
+        array, form = self._checked_states(states), form_of(self.task.scene)
         rows = form.lift(array) if form else tuple(array.T)
-        kicked = self.task.formulas.kick(np, list(real_array("draws", draws)), rows, self._constants)
+        numbers = _rows("draws", draws, (self.task.draws, len(array)), single=False)
+        kicked = self.task.formulas.kick(np, list(numbers), rows, self._constants)
         return np.stack(np.broadcast_arrays(*kicked[: self._n_state]), axis=-1)
 
     def _targets(self, targets: ArrayLike | None, n: int) -> Array:
@@ -316,19 +336,32 @@ class Model:
         if targets is None:
             given = np.empty(0) if fixed is None else fixed
             return np.ascontiguousarray(np.broadcast_to(given, (n, count)))
-        array = np.asarray(targets, np.float64)
+        array = real_array("targets", targets)
         if array.shape not in ([(), (n,)] if count == 1 else [(count,), (n, count)]):
             wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"
             raise ValueError(f"targets must have shape {wanted}, got {array.shape}")
-        return np.ascontiguousarray(np.broadcast_to(array.reshape(-1, count), (n, count)))
+        rows = np.broadcast_to(array.reshape(-1, count), (n, count))
+        return np.ascontiguousarray(_finite("targets", rows))
 
 
-def _rows(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return values of a shape, or one number for all of them; or raise a ValueError."""
+def _rows(name: str, values: ArrayLike, shape: tuple[int, ...], single: bool = True) -> Array:
+    """Return finite values of a shape, or where `single` one number for all; or raise a ValueError."""
     array = real_array(name, values)
-    if array.shape not in ((), shape):
-        raise ValueError(f"{name} must be one number or have shape {shape}, got {array.shape}")
-    return np.broadcast_to(array, shape)
+    if array.shape != shape and not (single and array.ndim == 0):
+        wanted = f"be one number or have shape {shape}" if single else f"have shape {shape}"
+        raise ValueError(f"{name} must {wanted}, got {array.shape}")
+    return np.broadcast_to(_finite(name, array), shape)
+
+
+def _finite(name: str, values: Array) -> Array:
+    """Return the values, or raise a ValueError that names the first row which is not finite."""
+    bad = ~np.isfinite(values)
+    if not bad.any():
+        return values
+    if not values.ndim:
+        raise ValueError(f"{name} must be finite, got {values}")
+    row = int(np.argwhere(bad)[0, 0])
+    raise ValueError(f"{name} must be finite, got {values[row]} in row {row}")
 
 
 def _moves(m: int) -> Array:

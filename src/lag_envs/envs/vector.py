@@ -165,7 +165,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             values = [constants[name] for constants in self._constants]
             self._write(f"k_{name}", self._lanes, np.array(values))
         self._started = False
-        self._over = 0
+        self._over = self._starts = 0
         #: Steps and sums of rewards of the episodes, if pictures show them.
         self._steps, self._totals = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
         self._seen = render_mode is not None and bool(show_readout or show_trail)
@@ -244,6 +244,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         observations = np.empty((len(self._program.o), self.num_envs), dtype=FLOAT32).T
         self._start(observations, mask, True, state is not None, target is not None)
         self._started = True
+        self._starts += 1
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
         self._steps[mask] = self._totals[mask] = 0
         return observations, self._infos(mask)
@@ -387,6 +388,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._keys[:, lanes] = snapshot.ids[:, lanes]
         self._steps[lanes], self._totals[lanes] = snapshot.steps[lanes], snapshot.totals[lanes]
         self._started = True
+        self._starts += 1
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
 
     @property
@@ -511,6 +513,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def ended(self) -> NDArray[np.bool_] | None:
         """The environments whose episodes are over, as a mask; None if there are none."""
         return self._read("n") < 0.0 if self._over else None
+
+    @property
+    def moment(self) -> tuple[int, int]:
+        """Numbers of steps and of other starts: the states stay as they are while both do."""
+        return self._turn, self._starts
 
     @property
     def limits(self) -> NDArray[np.float64]:

@@ -53,7 +53,8 @@ def checked(kind: Any, value: Any) -> Any:
         if what := _PLAINER.get(first["type"]):
             raise ValueError(f"{place} {what}") from None
         rule = first["msg"].removeprefix("Value error, ")
-        raise ValueError(f"{place}: {rule}, got {shown_ascii(first['input'])}".removeprefix(": ")) from None
+        got = "" if ", got " in rule else f", got {shown_ascii(first['input'])}"
+        raise ValueError(f"{place}: {rule}{got}".removeprefix(": ")) from None
 
 
 def accepted(kind: Any, value: Any, where: str) -> Any:

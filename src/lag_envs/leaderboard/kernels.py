@@ -14,9 +14,24 @@ from lag_envs.leaderboard.protocol import TINY
 from lag_envs.stepping.cache import jit
 
 
-@jit
 def affine(x: Any, weight: Any, bias: Any) -> Any:
-    """Return x @ weight + bias for x (n, i), weight (i, o), bias (o,)."""
+    """Return x @ weight + bias for x (n, i), weight (i, o), bias (o,).
+
+    Raises
+    ------
+    ValueError
+        For arrays whose lengths do not agree; compiled code would read outside them.
+    """
+    if x.shape[1:] != weight.shape[:1] or bias.shape != weight.shape[1:]:
+        raise ValueError(
+            f"a layer of weights {weight.shape} and biases {bias.shape} takes rows of {len(weight)} numbers, "
+            f"got shape {x.shape}"
+        )
+    return _affine(x, weight, bias)
+
+
+@jit
+def _affine(x: Any, weight: Any, bias: Any) -> Any:
     n, (many, wide) = len(x), weight.shape
     out, row = np.empty((n, wide)), np.empty(many)
     for r in range(n):

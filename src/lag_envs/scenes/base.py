@@ -549,7 +549,7 @@ class Scene(metaclass=SceneType):
         Raises
         ------
         ValueError, StepRefused
-            As `jacobian` does; ValueError also for a cotangent of another shape.
+            As `jacobian` does; ValueError also for a cotangent of another shape or too large.
 
         Examples
         --------

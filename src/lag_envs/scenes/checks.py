@@ -115,9 +115,10 @@ def check_controls(scene: Any, control: ArrayLike, ndim: int) -> Array:
     array, names = real_array("the control", control), scene.control_names
     bad = ~np.isfinite(array)
     if bad.any():
-        raise ValueError(
-            f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}"
-        )
+        place = f" at {np.argwhere(bad)[0].tolist()}" if array.ndim else ""
+        raise ValueError(f"the control must be finite, got {array[bad].flat[0]}{place}")
+    if array.shape == (0,) and ndim == 1 and names:  # a forgotten control, not a batch without rows
+        raise ValueError(f"the control must be ({', '.join(names)}), {len(names)} in all; got an empty array")
     if array.ndim == 0 and (len(names) == 1 or array == 0.0):
         return np.full(len(names), float(array))
     if len(names) == 1 and not (array.shape[-1] == 1 and array.ndim >= ndim):

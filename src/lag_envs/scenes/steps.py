@@ -200,7 +200,16 @@ def pulled(
 ) -> Array:
     """Return `vjp` of rows of checked arrays, side by side; `rows` are their numbers in error messages."""
     check_turns(scene, states, rows)
-    found, refused = _derivatives(scene, by).vjp(states, controls, dt, cotangents)
+    derivatives = _derivatives(scene, by)
+    found, refused = derivatives.vjp(states, controls, dt, cotangents)
+    if refused or not np.isfinite(found).all():
+        i = refused - 1 if refused else int(np.argwhere(~np.isfinite(found))[0, 0])
+        slopes, step_refused = derivatives.jacobian(states[i : i + 1], controls[i : i + 1], dt)
+        if not step_refused and np.isfinite(slopes).all():
+            raise ValueError(
+                f"the gradient of row {i if rows is None else rows[i]} is not finite: its cotangent "
+                f"{cotangents[i].tolist()} is too large; scale it down"
+            )
     _check_refused(scene, states, controls, dt, refused, rows)
     return found
 

@@ -17,7 +17,7 @@ from lag_envs.scenes.checks import StepRefused, check_number, check_parameters, 
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.fitting.determined import Determined
 from lag_envs.scenes.fitting.parameters import FreeParameters
-from lag_envs.scenes.fitting.recordings import Recording, guess, recordings_of
+from lag_envs.scenes.fitting.recordings import Recording, doubtful_units, guess, recordings_of
 from lag_envs.scenes.fitting.result import Fit, FitWarning
 from lag_envs.scenes.fitting.shooting import Shooting, cut
 
@@ -42,6 +42,11 @@ LEAST_RANGE = 1e-12
 WIDE, CORRELATED = 0.5, 0.999
 #: Residuals this many times the noise are a misfit; residuals below this part of the range do not matter.
 MISFIT, INVISIBLE = 2.0, 1e-6
+#: A residual this many times the spread of its state's residuals (that of a normal distribution with the same
+#: median of sizes) is an outlier, if there are at least so many.
+OUTLYING, LEAST_COUNT = 6.0, 20
+#: A search that did not converge, and left a parameter at this many times its first value, had no end.
+ENDLESS = 1e3
 #: How often the noise is estimated, and the fit repeated with it, at most.
 WEIGHINGS = 8
 
@@ -66,6 +71,9 @@ def fit(
     if not 0.0 < level < 1.0:
         raise ValueError(f"level must be between 0 and 1, got {level:g}")
     data = recordings_of(scene, recordings)
+    doubts = doubtful_units(scene, data)
+    for text in doubts:  # now, for the search would be long and may fail
+        warnings.warn(text, FitWarning, stacklevel=3)
     sizes = _Sizes(scene, data, noise)
     unknowns = len(names) + len(data) * len(scene.state_names)
     if sizes.count <= unknowns:
@@ -85,7 +93,7 @@ def fit(
         sizes.estimate(shooting, z, known.leverage)
         if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
             break
-    return _result(shooting, found, known, sizes, relaxed, level)
+    return _result(shooting, found, known, sizes, relaxed, level, doubts)
 
 
 class _Sizes:
@@ -196,7 +204,13 @@ def _explained(error: StepRefused, scene: Scene, data: list[Recording], sizes: _
 
 
 def _result(
-    shooting: Shooting, found: Any, known: Determined, sizes: _Sizes, relaxed: Array, level: float
+    shooting: Shooting,
+    found: Any,
+    known: Determined,
+    sizes: _Sizes,
+    relaxed: Array,
+    level: float,
+    doubts: list[str],
 ) -> Fit:
     from scipy.stats import norm, t
 
@@ -226,21 +240,28 @@ def _result(
         simulated=simulated,
     )
     texts = [] if found.success else ["the search ended before it converged; begin closer to the truth"]
-    texts += _doubts_of_parameters(fitted, parameters, best, errors) + _doubts_of_model(
-        fitted, sizes, relaxed
-    )
+    texts += _doubts_of_parameters(fitted, parameters, best, errors, found.success)
+    texts += _doubts_of_model(fitted, sizes, relaxed)
     for text in texts:
         warnings.warn(text, FitWarning, stacklevel=4)
-    return dataclasses.replace(fitted, warnings=tuple(texts))
+    return dataclasses.replace(fitted, warnings=(*doubts, *texts))
 
 
-def _doubts_of_parameters(fitted: Fit, parameters: FreeParameters, best: Array, errors: Array) -> list[str]:
+def _doubts_of_parameters(
+    fitted: Fit, parameters: FreeParameters, best: Array, errors: Array, converged: bool
+) -> list[str]:
     """Return warnings about the estimates of the parameters."""
-    texts, names = [], list(fitted.estimates)
+    texts, names, first = [], list(fitted.estimates), parameters.values(parameters.start)
     for i, (name, value) in enumerate(fitted.estimates.items()):
-        if min(best[i] - parameters.low[i], parameters.high[i] - best[i]) < 0.01 * errors[i]:
+        wide = fitted.errors[name] > WIDE * abs(value)
+        if wide and not converged and abs(value) > ENDLESS * abs(first[i]):
+            texts.append(
+                f"{name}={value:.3g} grew without bound: no value of it makes the model follow the data; "
+                "something that is held may be wrong, or the zero or sign of a measurement"
+            )
+        elif min(best[i] - parameters.low[i], parameters.high[i] - best[i]) < 0.01 * errors[i]:
             texts.append(f"{name}={value:.3g} lies at the end of its range: its interval is too short")
-        elif fitted.errors[name] > WIDE * abs(value):
+        elif wide:
             texts.append(
                 f"the data hardly determine {name}: {value:.3g} with a standard error of "
                 f"{fitted.errors[name]:.2g}"
@@ -269,9 +290,11 @@ def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
         least = sizes.noise[i] if sizes.given else relaxed[i]
         if size < INVISIBLE * sizes.range[i]:
             continue
+        texts += _outliers(fitted, name, columns)
         if size > MISFIT * least:
+            there = "where the noise was given as" if sizes.given else "where short pieces of it are off by"
             texts.append(
-                f"the model does not follow {name}: it is off by {size:.2g} {unit}, where the noise is "
+                f"the model does not follow {name}: it is off by {size:.2g} {unit}, {there} "
                 f"{least:.2g} {unit}; something that is held may be wrong, or a force is not modelled"
             )
         pairs = np.concatenate([c[1:] * c[:-1] for c in columns])
@@ -283,3 +306,22 @@ def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
                 f"{likeness:.2f}, so the intervals are too short; look at them with plot()"
             )
     return texts
+
+
+def _outliers(fitted: Fit, name: str, columns: Sequence[Array]) -> list[str]:
+    """Return a warning about residuals of a state, by recording, that are far larger than the others."""
+    sizes = [np.nan_to_num(np.abs(c)) for c in columns]
+    known = np.concatenate([np.abs(c[np.isfinite(c)]) for c in columns])
+    far = OUTLYING * 1.4826 * float(np.median(known))
+    count = int(np.sum(known > far))
+    if len(known) < LEAST_COUNT or not count:
+        return []
+    which = int(np.argmax([size.max() for size in sizes]))
+    row = int(np.argmax(sizes[which]))
+    recording, unit = fitted.recordings[which], fitted.scene.state_units[fitted.scene.state_names.index(name)]
+    where = f" of recording {which}" if len(columns) > 1 else ""
+    return [
+        f"{count} value{'s' * (count > 1)} of {name} may be misread: off by more than {far:.2g} {unit}, "
+        f"{OUTLYING:g} times the spread of the others; the largest, {sizes[which][row]:.2g} {unit}, at "
+        f"{row * recording.dt:.4g} s{where}. If so, give NaN there"
+    ]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.scenes.checks import check_sequence, check_step, real_array, shown
+from lag_envs.scenes.checks import check_sequence, check_step, is_masked, real_array
 from lag_envs.scenes.derivation import layout_of
 
 if TYPE_CHECKING:
@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 #: At most, for angles whose rates alone were measured: starts that are tried for each, those tried for all of
 #: them together, and samples compared.
 TRIED, MOST_TRIED, COMPARED = 16, 4096, 64
+#: An angle may be in degrees if it spans more turns, or moves over half a turn in more than this part of
+#: its steps.
+MANY_TURNS, OFTEN = 100.0, 0.1
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
 
@@ -53,14 +56,14 @@ def recordings_of(scene: Scene, given: Any) -> list[Recording]:
     """Return the recordings, checked, angles unwrapped; raise a ValueError that names what is wrong."""
     if not isinstance(given, Sequence) or isinstance(given, str) or not given:
         raise ValueError(
-            f"recordings must be a list of (states, controls, dt), at least one, got {shown(given)}"
+            f"recordings must be a list of (states, controls, dt), at least one, got {_kind(given)}"
         )
     if isinstance(given[-1], numbers.Real):
         raise ValueError("recordings must be a list of (states, controls, dt), got one; put it into a list")
     found = []
     for i, one in enumerate(given):
         if not isinstance(one, tuple | list) or len(one) != 3:
-            raise ValueError(f"recording {i} must be (states, controls, dt), got {shown(one)}")
+            raise ValueError(f"recording {i} must be (states, controls, dt), got {_kind(one)}")
         try:
             found.append(_recording(scene, *one))
         except ValueError as error:
@@ -74,7 +77,7 @@ def _recording(scene: Scene, states: Any, controls: Any, dt: Any) -> Recording:
             "dt must be one number [s]; where the times are not evenly spaced, put the samples on a finer "
             "even grid and NaN between them"
         )
-    names, array = scene.state_names, real_array("states", states)
+    names, array = scene.state_names, _numbers(states)
     if array.ndim != 2 or array.shape[1] != len(names):
         raise ValueError(
             f"states must have shape (N, {len(names)}), in each row {', '.join(names)} with NaN for what was "
@@ -89,6 +92,29 @@ def _recording(scene: Scene, states: Any, controls: Any, dt: Any) -> Recording:
     if not np.isfinite(array).any():
         raise ValueError("nothing was measured: all states are NaN")
     return Recording(_unwrapped(scene, array), _controls(scene, controls, len(array)), check_step(dt))
+
+
+def _numbers(states: Any) -> Array:
+    """Return states as float64 array, or raise a ValueError with the remedy."""
+    try:
+        return real_array("states", states)
+    except ValueError:
+        kind, remedy = _kind(states), "; np.array(states, float) makes NaN of None"
+        if is_masked(states):
+            kind, remedy = "a masked array", "; call filled(np.nan)"
+        elif isinstance(states, np.ndarray):
+            kind, remedy = f"an array of type {states.dtype}", remedy if states.dtype == object else ""
+        raise ValueError(
+            f"states must be real numbers, with NaN for what was not measured, got {kind}{remedy}"
+        ) from None
+
+
+def _kind(value: Any) -> str:
+    """Return what a value is, for a message; data would say nothing."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    name = f"a {type(value).__name__}"
+    return f"{name} of {len(value)}" if isinstance(value, tuple | list) else name
 
 
 def _controls(scene: Scene, controls: Any, count: int) -> Array:
@@ -117,6 +143,24 @@ def _unwrapped(scene: Scene, states: Array) -> Array:
         if angle and len(angles) and np.ptp(angles) <= ONE_TURN:
             states[seen, i] = np.unwrap(angles)
     return states
+
+
+def doubtful_units(scene: Scene, data: Sequence[Recording]) -> list[str]:
+    """Return warnings about angles of many turns, or many of more than half a turn: they may be degrees."""
+    texts = []
+    for i, entry in enumerate(layout_of(scene).state):
+        columns = [r.states[:, i] for r in data if r.measured[:, i].any()]
+        if not columns or entry.kind != "place" or entry.unit != "rad":
+            continue
+        turns = max(np.nanmax(c) - np.nanmin(c) for c in columns) / (2.0 * np.pi)
+        steps = np.concatenate([np.abs(np.diff(c)) for c in columns])
+        steps = steps[np.isfinite(steps)]
+        if turns > MANY_TURNS or (len(steps) and np.mean(steps > np.pi) > OFTEN):
+            texts.append(
+                f"{entry.name} spans {turns:.3g} turns in a recording; if it was measured in degrees, use "
+                "np.radians"
+            )
+    return texts
 
 
 def _row(bad: NDArray[np.bool_]) -> int:
