@@ -649,7 +649,7 @@ def test_agents_act_in_the_page_as_in_python(browsing, bare, monkeypatch, name, 
             return Array.from({ length: 60 }, () => {
                 const action = act(episode);
                 episode.step(action);
-                return action;
+                return [...action];
             });
         }""",
         [program, code, agent(policy)],

@@ -515,8 +515,8 @@
 
     function tick(now) {
       if (!playing) return;
-      // The first frame's time stamp may be from before the click.
-      time += (Math.max(0, now - before) / 1000) * Number(speed.value);
+      // The first frame's time stamp may be from before the click, and none comes while the page is hidden.
+      time += (clamp(now - before, 0, 100) / 1000) * Number(speed.value);
       before = now;
       if (time >= end()) {
         if (loop.checked && end() > 0) time = 0;
@@ -1211,7 +1211,7 @@
     const root = find("#drive");
     if (!root) return null;
     const [begin, said] = [find(".begin", root), find(".status", root)];
-    const tools = { make, find, text, symbol, fit, paint, placed, windowOf, posesAt, load, episodes, calm };
+    const tools = { make, all, text, symbol, fit, paint, placed, windowOf, posesAt, load, episodes, calm };
     let driver = null;
 
     async function open(wanted) {
