@@ -347,7 +347,7 @@ class Brake(Task):
     quantities = {
         "distance": ("m", "distance to the line, -x"),
         "v": ("m/s", "speed x' down the slope"),
-        "drag": ("kg/s", "coefficient of the brake"),
+        "drag": ("N s/m", "coefficient of the brake"),
     }
     scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}

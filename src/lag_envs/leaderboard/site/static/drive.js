@@ -66,7 +66,7 @@
     return [high, low];
   }
 
-  const halves = (word) => [Number(word >> big(32)), Number(BigInt.asUintN(32, word))];
+  const halves = (word) => [Number(big(word) >> big(32)), Number(BigInt.asUintN(32, big(word)))];
 
   /** Draw `index` of step `step`, in [0, 1). */
   function uniform(key, step, index) {
