@@ -560,7 +560,7 @@
 
   const PAIRS = [["ArrowLeft", "ArrowRight"], ["ArrowDown", "ArrowUp"], ["a", "d"], ["s", "w"]];
   const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowDown: "↓", ArrowUp: "↑" };
-  const SPOKEN = { "←": "left arrow", "→": "right arrow", "↓": "down arrow", "↑": "up arrow" };
+  const SPOKEN = { ArrowLeft: "left arrow", ArrowRight: "right arrow", ArrowDown: "down arrow", ArrowUp: "up arrow" };
   const nameOf = (key) => NAMES[key] ?? key.toUpperCase();
 
   /** Keys, pointer and gamepad as numbers per control. */
@@ -703,17 +703,25 @@
     });
     const choices = Math.max(0, ...about.controls.map(({ values }) => values.length));
     const listed = choices ? `, or 1 to ${Math.min(choices, 9)} for one of the listed actions` : "";
-    const how = hands.pairs
-      .map(([down, up], i) => {
-        const { meaning, name, unit } = about.controls[i];
-        return `${nameOf(down)} ${nameOf(up)} ${meaning ?? symbol(name)}${unit && ` [${unit}]`}`;
+    /** The keys and what they control, to be read or to be heard. */
+    const described = (keys, name, unitOf) => hands.pairs
+      .map((pair, i) => {
+        const { meaning, unit } = about.controls[i];
+        return `${keys(pair)} ${[meaning, name(about.controls[i])].filter(Boolean).join(" ")}${unit && unitOf(unit)}`;
       })
       .join(", ") + listed;
+    const words = ({ name }) => name.replace(/_/g, " ");
+    const letter = (control) => (control.meaning && symbol(control.name) === words(control) ? "" : symbol(control.name));
+    const how = described((pair) => pair.map(nameOf).join(" "), letter, (unit) => ` [${unit}]`);
+    const heard = described(
+      (pair) => `${pair.map((key) => SPOKEN[key] ?? nameOf(key)).join(" and ")}:`,
+      (control) => (control.meaning ? "" : words(control)),
+      (unit) => ` in ${unit}`,
+    );
     const ways = how ? `${how}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch.";
     const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
-    const hint = `${ways} Space starts.${nothing}`;
-    const aloud = how.replace(/[←→↓↑]/g, (arrow) => SPOKEN[arrow]).replace(/\[|\]/g, "");
-    stage.setAttribute("aria-label", `Drive ${board.id}. ${aloud || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
+    const hint = `${ways} Space or a tap starts.${nothing}`;
+    stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
 
     let { constants } = code;
     let seed = big(Math.floor(Math.random() * 2 ** 32));

@@ -311,7 +311,7 @@
       requestAnimationFrame(frame);
     };
     const show = () => {
-      button.textContent = running ? "Pause" : "Play";
+      button.textContent = running ? "Pause the episode" : "Play the episode";
       begun = 0;
       if (running && replay) requestAnimationFrame(frame);
       else poster(canvas, board);
