@@ -192,7 +192,9 @@ def link_of(page):
 def test_by_keys_alone(drive, capsys):
     """Tab, arrows, Space, R and N; the command confirms the drive."""
     page = drive(incline.Tilt.id, hash="#seed=12")
-    assert "← → rate of the tilt φ\u0307 [rad/s]" in message(page) and "Space or a tap starts" in message(page)
+    assert "← → rate of the tilt φ\u0307 [rad/s]" in message(page) and "Space or a tap starts" in message(
+        page
+    )
     page.focus("main")
     for _ in range(40):
         page.keyboard.press("Tab")
