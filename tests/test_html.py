@@ -78,6 +78,7 @@ def test_equations_are_those_of_the_scene():
 def test_formulas_of_a_notebook():
     """Terms wrap; a rate's index and exponent are beside one dotted letter; only short parts are indices."""
     import sympy
+
     from lag_envs.scenes.symbolic import t
 
     rest, mass = sympy.symbols("rest_length mass_12")

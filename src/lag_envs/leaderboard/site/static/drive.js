@@ -664,7 +664,7 @@
 
   /** Build the driver into an element and return it. */
   function open(root, board, code, tools) {
-    const { make, all, text, symbol, fit, paint, placed, windowOf, posesAt, load, calm } = tools;
+    const { make, all, text, symbol, fit, paint, placed, apart, windowOf, posesAt, load, calm } = tools;
     const { about } = code;
     const known = board.known && board.known.best !== board.known.random ? board.known : null;
     const scoreOf = (total) => (total - known.random) / (known.best - known.random);
@@ -984,7 +984,7 @@
         const beside = ghostAt(part);
         if (beside) {
           pen.globalAlpha = 0.35;
-          paint(pen, box, seenFrom, placed(picture, beside.poses, seenFrom), ["body", "mark"]);
+          paint(pen, box, seenFrom, placed(apart(picture, beside.poses, poses), beside.poses, seenFrom));
           pen.globalAlpha = 1;
         }
       }
