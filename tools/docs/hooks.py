@@ -7,7 +7,7 @@ import posixpath
 import re
 import sys
 from functools import cache
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +113,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))
     markdown = markdown.replace("members: SCENES\n", f"members: [{names}]\n")
-    page.meta.setdefault("description", description(page, markdown))
+    page.meta.setdefault("description", escape(description(page, markdown)))  # the theme does not
     at_root = {place: name for name, place in ROOT_FILES.items()}
     here = at_root.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
@@ -193,7 +193,7 @@ def preview(page: Page, config: MkDocsConfig) -> str:
     """Return the tags of a page's title, description and picture."""
     from lag_envs.tasks import TASKS
 
-    title, about = page.meta.get("title", page.title), page.meta["description"]
+    title, about = page.meta.get("title", page.title), unescape(page.meta["description"])
     picture = page.title if page.title in TASKS else next(iter(TASKS))
     shown = f"{MOVING}/{picture}.webp"
     tags = {"type": "article", "site_name": config.site_name, "title": title, "description": about}
