@@ -113,7 +113,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))
     markdown = markdown.replace("members: SCENES\n", f"members: [{names}]\n")
-    page.meta.setdefault("description", escape(description(page, markdown)))  # the theme does not
+    about = config.extra["descriptions"].get(page.file.src_uri) or description(page, markdown)
+    page.meta.setdefault("description", escape(about))  # the theme does not escape it
     at_root = {place: name for name, place in ROOT_FILES.items()}
     here = at_root.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
@@ -142,10 +143,13 @@ def description(page: Page, markdown: str) -> str:
 
     if page.title in TASKS:
         return (TASKS[page.title].__doc__ or "").partition("\n")[0]
+    markdown = re.sub(r"^```.*?^```", "", markdown, flags=re.DOTALL | re.MULTILINE)
     texts = [part for part in re.split(r"\n\s*\n", markdown) if re.match(r"[A-Z*`\[]", part)]
     if not texts:
-        return f"{page.title} of lag_envs"
-    plain = re.sub(r"\[([^\]]*)\]\([^)]*\)|[*`]", lambda found: found[1] or "", " ".join(texts[0].split()))
+        return f"API reference of lag_envs: {page.title}"
+    plain = re.sub(
+        r"\[([^\]]*)\]\([^)]*\)|[*`]", lambda found: found[1] or "", " ".join(" ".join(texts).split())
+    )
     if len(plain) <= LONGEST:
         return plain
     whole = plain[:LONGEST].rpartition(". ")[0]
