@@ -234,6 +234,15 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
                 assert (shape[3] if what == "circle" else shape[2] if what != "magnifier" else None) == role
                 own = [*shape[1], shape[2]] if round_one else shape[1]
                 np.testing.assert_allclose(own, points, atol=1e-4 * size)
+    # A ghost brings the parts of the frame that are elsewhere, such as a turned arm.
+    shown = Picture(TASKS["RotaryPendulum-v0"]())
+    moments = [shown.poses(Frame([angle, 0.0, 0.1, 0.0])) for angle in (0.0, 1.0)]
+    roles = page.evaluate(
+        "([picture, now, there]) => [there, now].map((other) =>"
+        "lagEnvs.apart(picture, now, other).shapes.map((shape) => shape[shape.length - 1]))",
+        [picture_data(shown), *moments],
+    )
+    assert roles == [["frame", "body"], ["body"]]
 
 
 def test_sorting_by_mouse_and_keyboard(open_page, data):

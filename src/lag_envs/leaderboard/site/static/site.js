@@ -1274,7 +1274,7 @@
 
   // --- start -----------------------------------------------------------------------------------------------
 
-  window.lagEnvs = { put, load, placed, windowOf };
+  window.lagEnvs = { put, load, placed, windowOf, apart };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
   readColours();
