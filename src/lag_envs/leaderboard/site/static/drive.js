@@ -718,9 +718,9 @@
       (control) => (control.meaning ? "" : words(control)),
       (unit) => ` in ${unit}`,
     );
-    const ways = how ? `${how}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch.";
     const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
-    const hint = `${ways} Space or a tap starts.${nothing}`;
+    const starting = (keys) =>
+      `${keys ? `${keys}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space or a tap starts.${nothing}`;
     stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
 
     let { constants } = code;
@@ -743,9 +743,9 @@
     /** A return, and its score if the episode is whole: where rewards are costs, a part of it looks too good. */
     const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode.total))}` : ""}`;
 
-    const tell = (words) => {
+    const tell = (words, spoken = words) => {
       message.textContent = words;
-      said.textContent = words;
+      said.textContent = spoken;
     };
 
     // --- ghosts
@@ -932,7 +932,7 @@
     }
 
     function label() {
-      stage.classList.toggle("driving", running);
+      stage.toggleAttribute("data-driving", running);
       go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
     }
 
@@ -1172,7 +1172,7 @@
       running = false;
       rerunning = null;
       restart();
-      tell(hint);
+      tell(starting(how), starting(heard));
     }
 
     // --- what people do
@@ -1307,7 +1307,7 @@
     listGhosts();
     restart();
     warmUp();
-    tell(hint);
+    tell(starting(how), starting(heard));
     if (calm.matches) speed.value = "0.5";
     const there = [...(navigator.getGamepads?.() ?? [])].find((pad) => pad?.connected);
     if (there) take(there);
