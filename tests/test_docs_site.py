@@ -16,7 +16,7 @@ from mkdocs.config import load_config
 
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, acrobot, chain
 from tools.docs import equations
 
 ROOT = Path(__file__).parents[1]
@@ -231,7 +231,10 @@ BROKEN = r"""[...document.querySelectorAll('td code')].flatMap(({ firstChild: te
 def test_code_and_formulas_are_readable(site, browser):
     """Tables keep the words of code whole, and only single terms are wider than the page."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
-    for name in ("environments/TripleBar-v0", "environments/AcrobotReal-v0", "physics"):
+    for name in (
+        *(f"environments/{kind.id}" for kind in (chain.SwingUpTriple, acrobot.AcrobotReal)),
+        "physics",
+    ):
         page.goto(f"{site.as_uri()}/{name}.html")
         assert page.evaluate(BROKEN) == [], name
         widths = page.evaluate(

@@ -21,7 +21,7 @@ from lag_envs.leaderboard.standings import board_data
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Magnifier, Polygon
-from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline
+from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline, rotary_pendulum
 from tests import board_pages
 from tests.board_pages import HOSTILE, clean
 
@@ -235,7 +235,7 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
                 own = [*shape[1], shape[2]] if round_one else shape[1]
                 np.testing.assert_allclose(own, points, atol=1e-4 * size)
     # A ghost brings the parts of the frame that are elsewhere, such as a turned arm.
-    shown = Picture(TASKS["RotaryPendulum-v0"]())
+    shown = Picture(rotary_pendulum.RotarySwingUp())
     moments = [shown.poses(Frame([angle, 0.0, 0.1, 0.0])) for angle in (0.0, 1.0)]
     roles = page.evaluate(
         "([picture, now, there]) => [there, now].map((other) =>"
