@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
-from browsers import serious
+from browsers import serious, until
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
@@ -231,10 +231,8 @@ BROKEN = r"""[...document.querySelectorAll('td code')].flatMap(({ firstChild: te
 def test_code_and_formulas_are_readable(site, browser):
     """Tables keep the words of code whole, and only single terms are wider than the page."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
-    for name in (
-        *(f"environments/{kind.id}" for kind in (chain.SwingUpTriple, acrobot.AcrobotReal)),
-        "physics",
-    ):
+    pages = [f"environments/{kind.id}" for kind in (chain.SwingUpTriple, acrobot.AcrobotReal)]
+    for name in [*pages, "physics"]:
         page.goto(f"{site.as_uri()}/{name}.html")
         assert page.evaluate(BROKEN) == [], name
         widths = page.evaluate(
@@ -251,7 +249,7 @@ def test_pictures_can_stand_still(site, browser):
         shown = "document.querySelector('.moving img').currentSrc"
         label = "document.querySelector('.moving button').textContent"
         for still in (motion == "reduce", motion != "reduce"):
-            assert page.evaluate(shown).endswith("-still.webp") == still
+            until(page, f"{shown}.endsWith('-still.webp') === {str(still).lower()}", 10.0)
             assert page.evaluate(label) == ("Play the picture" if still else "Pause the picture")
             page.click(".moving button")
         page.close()
