@@ -10,13 +10,13 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
-from browsers import serious
+from browsers import serious, until
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, acrobot, chain
 from tools.docs import equations
 
 ROOT = Path(__file__).parents[1]
@@ -89,12 +89,30 @@ def test_titles_and_previews(site, pages):
     titles = {name: re.search("<title>(.*?)</title>", text)[1] for name, text in texts.items()}
     docs = [title for name, title in titles.items() if not name.startswith("board/")]
     assert len(set(docs)) == len(docs) > 50
+    assert titles["index.html"] == "Lagrangian mechanics as Gymnasium environments - lag_envs"
     for name, text in texts.items():
         for what in ("title", "description"):
             assert text.count(f'<meta property="og:{what}"') == 1, name
+    told = {
+        name: re.search('<meta name="description" content="(.*?)">', text)[1] for name, text in texts.items()
+    }
+    own = [about for name, about in told.items() if not name.startswith("board/")]
+    assert len(set(own)) == len(own) and all(20 < len(about) < 300 for about in own)
     for env_id in TASKS:
         head = texts[f"environments/{env_id}.html"].partition("</head>")[0]
         assert f'og:description" content="{escape(TASKS[env_id].__doc__.partition(chr(10))[0])}"' in head
+
+
+def test_lists_of_pages(site):
+    """Sitemap and feed name the board, and a page that is missing leads home."""
+    places = (site / "sitemap.xml").read_text("utf-8")
+    for name in ("index.html", "board/index.html", *(f"board/{env_id}.html" for env_id in TASKS)):
+        assert places.count(f"/lag-envs/{name}</loc>") == 1, name
+    ElementTree.fromstring(places)
+    feed = ElementTree.parse(site / "board" / "feed.xml")
+    (itself,) = feed.iterfind("{*}link[@rel='self']")
+    assert itself.get("href").endswith("/lag-envs/board/feed.xml")
+    assert "To the home page</a>" in (site / "404.html").read_text("utf-8")
 
 
 def test_one_navigation(pages):
@@ -150,12 +168,17 @@ def test_formulas_are_whole(site):
     parts = {"msup": 2, "msub": 2, "mfrac": 2, "mover": 2, "msubsup": 3}
     found = []
     for name in ("scenes.html", *(f"environments/{env_id}.html" for env_id in TASKS)):
-        found += re.findall(r"<math.*?</math>", (site / name).read_text("utf-8"), re.DOTALL)
+        text = (site / name).read_text("utf-8")
+        wide = re.findall('<div class="equation".*?</div>', text, re.DOTALL)
+        alone = re.findall(
+            r"<math.*?</math>", re.sub('<div class="equation".*?</div>', "", text, flags=re.DOTALL)
+        )
+        assert all(one.count("</annotation>") == 1 for one in (*wide, *alone))
+        found += [*alone, *(part for one in wide for part in re.findall(r"<math.*?</math>", one, re.DOTALL))]
     assert len(found) > 3 * len(TASKS)
     for formula in map(ElementTree.fromstring, found):
         elements = [(element.tag.rpartition("}")[2], element) for element in formula.iter()]
         assert all(len(element) == parts.get(tag, len(element)) for tag, element in elements)
-        assert [element.text for tag, element in elements if tag == "annotation"]
 
 
 def test_symbols_are_those_of_the_docstrings():
@@ -188,6 +211,48 @@ def test_in_a_browser(site, browser):
     page.get_by_role("textbox", name="Search").fill("truncation bound")
     page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
     assert not asked
+
+
+#: Words of code in tables that are broken in two.
+BROKEN = r"""[...document.querySelectorAll('td code')].flatMap(({ firstChild: text }) => {
+    if (text?.nodeType !== 3) return [];
+    const top = (i) => {
+        const range = document.createRange();
+        range.setStart(text, i);
+        range.setEnd(text, i + 1);
+        return range.getBoundingClientRect().top;
+    };
+    const places = [...text.data].keys();
+    const word = (i) => /\w\w/.test(text.data.slice(i, i + 2));
+    return [...places].some((i) => word(i) && top(i + 1) > top(i) + 4) ? [text.data] : [];
+})"""
+
+
+def test_code_and_formulas_are_readable(site, browser):
+    """Tables keep the words of code whole, and only single terms are wider than the page."""
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    pages = [f"environments/{kind.id}" for kind in (chain.SwingUpTriple, acrobot.AcrobotReal)]
+    for name in [*pages, "physics"]:
+        page.goto(f"{site.as_uri()}/{name}.html")
+        assert page.evaluate(BROKEN) == [], name
+        widths = page.evaluate(
+            "[...document.querySelectorAll('.equation')].map((e) => e.scrollWidth / e.clientWidth)"
+        )
+        assert max(widths, default=0.0) < 1.2, name
+    page.close()
+
+
+def test_pictures_can_stand_still(site, browser):
+    for motion in ("reduce", "no-preference"):
+        page = browser.new_page(reduced_motion=motion)
+        page.goto(f"{site.as_uri()}/environments/{next(iter(TASKS))}.html")
+        shown = "document.querySelector('.moving img').currentSrc"
+        label = "document.querySelector('.moving button').textContent"
+        for still in (motion == "reduce", motion != "reduce"):
+            until(page, f"{shown}.endsWith('-still.webp') === {str(still).lower()}", 10.0)
+            assert page.evaluate(label) == ("Play the picture" if still else "Pause the picture")
+            page.click(".moving button")
+        page.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

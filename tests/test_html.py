@@ -70,9 +70,24 @@ def test_equations_are_those_of_the_scene():
 
     text = Swing()._repr_html_()
     assert "A bob &lt;on&gt; a rod." in text
-    equation = re.sub(r"<[^>]*>", " ", unescape(text.rpartition("<math")[2])).split()
+    equation = re.sub(r"<[^>]*>", " ", unescape(text.rpartition("Equations of motion")[2])).split()
     assert equation.count("θ") == 2 and equation.count("¨") == 1 and equation.count("˙") == 0
     assert {"torque", "mass", "length", "sin", "981"} <= set(equation) and equation[-2:] == ["=", "0"]
+
+
+def test_formulas_of_a_notebook():
+    """Terms wrap; a rate's index and exponent are beside one dotted letter; only short parts are indices."""
+    import sympy
+
+    from lag_envs.scenes.symbolic import t
+
+    rest, mass = sympy.symbols("rest_length mass_12")
+    rate = sympy.Function("theta_1")(t).diff(t)
+    text = html.mathml(rest * rate**2 - mass, " = 0")
+    assert text.count("<math ") == 2 and '<mo form="infix">' in text
+    assert "<mi>rest_length</mi>" in text and "<msub><mi>mass</mi><mn>12</mn></msub>" in text
+    dotted = f"{html.LOW}<mover><mi>θ</mi><mo>˙</mo></mover></mpadded>"
+    assert f"<msubsup>{dotted}<mn>1</mn><mn>2</mn></msubsup>" in text
 
 
 def test_without_sympy_the_rest_is_shown(monkeypatch):

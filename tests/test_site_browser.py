@@ -21,7 +21,7 @@ from lag_envs.leaderboard.standings import board_data
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Magnifier, Polygon
-from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline
+from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline, rotary_pendulum
 from tests import board_pages
 from tests.board_pages import HOSTILE, clean
 
@@ -234,6 +234,15 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
                 assert (shape[3] if what == "circle" else shape[2] if what != "magnifier" else None) == role
                 own = [*shape[1], shape[2]] if round_one else shape[1]
                 np.testing.assert_allclose(own, points, atol=1e-4 * size)
+    # A ghost brings the parts of the frame that are elsewhere, such as a turned arm.
+    shown = Picture(rotary_pendulum.RotarySwingUp())
+    moments = [shown.poses(Frame([angle, 0.0, 0.1, 0.0])) for angle in (0.0, 1.0)]
+    roles = page.evaluate(
+        "([picture, now, there]) => [there, now].map((other) =>"
+        "lagEnvs.apart(picture, now, other).shapes.map((shape) => shape[shape.length - 1]))",
+        [picture_data(shown), *moments],
+    )
+    assert roles == [["frame", "body"], ["body"]]
 
 
 def test_sorting_by_mouse_and_keyboard(open_page, data):
@@ -310,6 +319,11 @@ def test_player(open_page, data):
     page.click(".play")
     assert page.evaluate("document.querySelector('.play').getAttribute('aria-label')") == "Pause"
     until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.32")
+    # A page that was hidden, or busy, goes on where it was.
+    now = clock(page)
+    page.evaluate("() => { for (const end = performance.now() + 1500; performance.now() < end;); }")
+    page.wait_for_timeout(50)
+    assert clock(page) < now + 1.0
     page.keyboard.press("Space")  # the button has the focus; the clock goes to the nearest whole step
     stopped = clock(page)
     assert (

@@ -10,3 +10,24 @@ document$.subscribe(() => {
     for (const one of document.querySelectorAll(".md-typeset__scrollwrap, .equation")) scrolled.observe(one);
   });
 });
+
+// A moving picture can be stopped, and stands still for readers who prefer reduced motion.
+document$.subscribe(() => {
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
+  for (const picture of document.querySelectorAll(".moving picture")) {
+    const [source, image] = [picture.querySelector("source"), picture.querySelector("img")];
+    const [moving, still] = [image.src, source.srcset];
+    const button = document.createElement("button");
+    let playing = !calm.matches;
+    const label = () => (button.textContent = playing ? "Pause the picture" : "Play the picture");
+    button.type = "button";
+    button.addEventListener("click", () => {
+      playing = !playing;
+      source.remove();
+      image.src = playing ? moving : still;
+      label();
+    });
+    label();
+    picture.after(button);
+  }
+});

@@ -209,12 +209,14 @@ def _actions(task: Task) -> str:
     for i, acting in enumerate(task.formulas.acting):
         ends = acting.values or (acting.low, acting.high)
         values = [", ".join(map(number_text, ends)), ""] if acting.values else [*map(number_text, ends)]
-        rows.append([str(i), f"`{acting.control}`", units[acting.control], *values])
+        _, meaning = task.quantities.get(acting.control, ("", ""))
+        rows.append([str(i), f"`{acting.control}`", meaning, units[acting.control], *values])
     top = task.formulas.largest
     listed = any(acting.values for acting in task.formulas.acting)
     head = [
         "Num",
         "Control",
+        "Meaning",
         "Unit",
         *(("Values, by action", "") if listed else (f"At {number_text(-top)}", f"At {number_text(top)}")),
     ]

@@ -16,6 +16,7 @@ from sympy.simplify.fu import TR10i
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene, symbolic
 from lag_envs.scenes.derivation import layout_of
+from lag_envs.scenes.html import LOW, wrapped_mathml
 from tools.docs.markdown import groups, parameter_descriptions
 
 #: A letter by itself, which is the symbol that a docstring gives a parameter: "Mass m of the bar."
@@ -125,9 +126,37 @@ def _word(name: str) -> str:
 
 
 def formula_mathml(latex: str, block: bool = True) -> str:
-    """Return a formula as MathML that includes its LaTeX; a block formula can be scrolled sideways."""
-    element = convert(latex, display="block" if block else "inline")
-    head, body = re.fullmatch(r"(<math[^>]*>)(.*)</math>", element, re.DOTALL).groups()  # type: ignore[union-attr]
+    """Return a formula as MathML that includes its LaTeX; the lines of a block formula end before + and -."""
+    parts = split_terms(latex) if block else [latex]
+    bodies = [_body(part) for part in parts]
+    source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
+    bodies[0] = f"<semantics><mrow>{bodies[0]}</mrow>{source}</semantics>"
+    if not block:
+        return f'<math xmlns="http://www.w3.org/1998/Math/MathML">{bodies[0]}</math>'
+    return f'<div class="equation" tabindex="0">{wrapped_mathml(bodies)}</div>'
+
+
+def split_terms(latex: str) -> list[str]:
+    r"""Split a formula before each + and - that is between terms and outside of brackets.
+
+    Examples
+    --------
+    >>> split_terms(r"x = - a (b + c) - \frac{d + e}{2} + f = 0")
+    ['x = - a (b + c) ', '- \\frac{d + e}{2} ', '+ f = 0']
+    """
+    parts, depth = [""], 0
+    for letter in latex:
+        depth += (letter in "({") - (letter in ")}")
+        before = parts[-1].rstrip()
+        if letter in "+-" and not depth and before and not before.endswith("="):
+            parts.append("")
+        parts[-1] += letter
+    return parts
+
+
+def _body(latex: str) -> str:
+    element = convert(latex)
+    (body,) = re.fullmatch(r"<math[^>]*><mrow>(.*)</mrow></math>", element, re.DOTALL).groups()  # type: ignore[union-attr]
     # Several upright letters in a row are a word.
     body = re.sub(
         r'(?:<mi mathvariant="normal">[a-z]</mi>|<mtext>&#x000A0;</mtext>){2,}',
@@ -136,6 +165,4 @@ def formula_mathml(latex: str, block: bool = True) -> str:
     )
     space = '<mspace width="0.17em"></mspace>'
     body = re.sub(r"<mi>(sin|cos|tan|arctan)</mi>", rf"<mrow>{space}\g<0>{space}</mrow>", body)
-    source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
-    whole = f"{head}<semantics><mrow>{body}</mrow>{source}</semantics></math>"
-    return f'<div class="equation" tabindex="0">{whole}</div>' if block else whole
+    return re.sub(r"<mover>.*?</mover>", rf"{LOW}\g<0></mpadded>", body)

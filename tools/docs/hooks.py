@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import posixpath
 import re
 import sys
 from functools import cache
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ ROOT_FILES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.m
 SOURCE = "https://github.com/lag-envs/lag-envs/blob/main/"
 #: Places of the leaderboard's page and of the environments' pages.
 BOARD, ENVIRONMENTS = "board", "environments"
+MOVING = "images/moving"
+#: The longest description of a page.
+LONGEST = 200
 
 
 @cache
@@ -62,7 +66,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     texts = generated() | {
         place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_FILES.items()
     }
-    for place, content in (texts | board_pages(config)).items():
+    for place, content in (texts | board_pages(config) | stills()).items():
         files.append(File.generated(config, place, content=content))
     return files
 
@@ -80,12 +84,37 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
     return {f"{BOARD}/{name}": content for name, content in (pages | files).items()}
 
 
+def stills() -> dict[str, str | bytes]:
+    """Return a frame from the middle of each moving picture, for readers who do not want motion."""
+    from PIL import Image
+
+    found: dict[str, str | bytes] = {}
+    for path in sorted((ROOT / "docs" / MOVING).glob("*.webp")):
+        with Image.open(path) as picture:
+            picture.seek(picture.n_frames // 2)
+            picture.save(kept := io.BytesIO(), "WEBP", quality=80)
+        found[f"{MOVING}/{path.stem}-still.webp"] = kept.getvalue()
+    return found
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Give moving pictures their stills; docs/assets/docs.js adds a button."""
+    return re.sub(
+        rf'<img [^>]*src="([^"]*{MOVING}/[^"]+)\.webp"[^>]*>',
+        r'<span class="moving"><picture><source media="(prefers-reduced-motion: reduce)" '
+        r'srcset="\1-still.webp">\g<0></picture></span>',
+        html,
+    )
+
+
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Fill in the scenes' names, and redirect links out of the folder docs to the site or to the source."""
     from lag_envs.scenes import SCENES
 
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))
     markdown = markdown.replace("members: SCENES\n", f"members: [{names}]\n")
+    about = config.extra["descriptions"].get(page.file.src_uri) or description(page, markdown)
+    page.meta.setdefault("description", escape(about))  # the theme does not escape it
     at_root = {place: name for name, place in ROOT_FILES.items()}
     here = at_root.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
@@ -108,6 +137,25 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return re.sub(r"\]\(([^)\s]+)\)", link, markdown)
 
 
+def description(page: Page, markdown: str) -> str:
+    """Return what a page is about: an environment's first line, or the first sentences of the text."""
+    from lag_envs.tasks import TASKS
+
+    if page.title in TASKS:
+        return (TASKS[page.title].__doc__ or "").partition("\n")[0]
+    markdown = re.sub(r"^```.*?^```", "", markdown, flags=re.DOTALL | re.MULTILINE)
+    texts = [part for part in re.split(r"\n\s*\n", markdown) if re.match(r"[A-Z*`\[]", part)]
+    if not texts:
+        return f"API reference of lag_envs: {page.title}"
+    plain = re.sub(
+        r"\[([^\]]*)\]\([^)]*\)|[*`]", lambda found: found[1] or "", " ".join(" ".join(texts).split())
+    )
+    if len(plain) <= LONGEST:
+        return plain
+    whole = plain[:LONGEST].rpartition(". ")[0]
+    return f"{whole}." if whole else f"{plain[:LONGEST].rpartition(' ')[0]} ..."
+
+
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
     """Add the board, which is built beside the pages, and the guide to it."""
     for section in nav.items:
@@ -123,7 +171,19 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
-    """Name the search also in pages that are not in the navigation, such as 404.html."""
+    """Complete the pages and lists that are not in the navigation."""
+    if template_name == "sitemap.xml":
+        from lag_envs.tasks import TASKS
+
+        added = "".join(
+            f"  <url><loc>{config.site_url}{BOARD}/{name}.html</loc></url>\n" for name in ("index", *TASKS)
+        )
+        return output_content.replace("</urlset>", f"{added}</urlset>")
+    if template_name == "404.html":
+        told = (
+            f'<p>This page does not exist, or has moved. <a href="{config.site_url}">To the home page</a></p>'
+        )
+        output_content = output_content.replace("</h1>", f"</h1>\n{told}", 1)
     return with_search_name(output_content)
 
 
@@ -137,11 +197,9 @@ def preview(page: Page, config: MkDocsConfig) -> str:
     """Return the tags of a page's title, description and picture."""
     from lag_envs.tasks import TASKS
 
-    title, about, picture = page.meta.get("title", page.title), config.site_description, next(iter(TASKS))
-    if page.title in TASKS:
-        picture = page.title
-        about = (TASKS[picture].__doc__ or "").partition("\n")[0]
-    shown = f"images/moving/{picture}.webp"
+    title, about = page.meta.get("title", page.title), unescape(page.meta["description"])
+    picture = page.title if page.title in TASKS else next(iter(TASKS))
+    shown = f"{MOVING}/{picture}.webp"
     tags = {"type": "article", "site_name": config.site_name, "title": title, "description": about}
     if (ROOT / "docs" / shown).is_file():
         tags["image"] = f"{config.site_url}{shown}"

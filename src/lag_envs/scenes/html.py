@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Sequence
 from html import escape
 from importlib.util import find_spec
@@ -13,6 +14,12 @@ from lag_envs.scenes.derivation import layout_of
 
 #: Operations of a Lagrangian up to which its equations of motion are written out.
 LONGEST = 150
+#: A name whose last part, a number or a letter, is an index; in "rest_length" all of it is a name.
+SUBSCRIPT = re.compile(r"(.*[^\W\d_])(?:_?(\d+)|_([^\W\d_]))")
+#: Browsers set exponents above the whole of a letter with dots; with this height they forget the dots.
+HEIGHT = "0.7em"
+NO_BREAK = "\N{NO-BREAK SPACE}"
+LOW = f'<mpadded height="{HEIGHT}">'
 
 
 def html_table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
@@ -82,21 +89,35 @@ def mathml(expression: Any, behind: str = "") -> str:
     import sympy
     from sympy.core.function import AppliedUndef
     from sympy.printing.mathml import MathMLPresentationPrinter
+    from sympy.printing.pretty.pretty_symbology import greek_unicode
 
     class Printer(MathMLPresentationPrinter):
-        """Writes names that end in primes with dots above them."""
+        """Writes names that end in primes with dots above them, and subscripts below exponents."""
+
+        def _element(self, name: str, *children: Any) -> Any:
+            made = self.dom.createElement(name)
+            for child in children:
+                made.appendChild(self.dom.createTextNode(child) if isinstance(child, str) else child)
+            return made
 
         def _print_Symbol(self, symbol: Any, style: str = "plain") -> Any:
             name = symbol.name.rstrip("'")
             dots = len(symbol.name) - len(name)
-            written = super()._print_Symbol(sympy.Symbol(name), style)
-            if not dots:
-                return written
-            over, above = self.dom.createElement("mover"), self.dom.createElement("mo")
-            above.appendChild(self.dom.createTextNode("˙" if dots == 1 else "¨"))
-            over.appendChild(written)
-            over.appendChild(above)
-            return over
+            short = SUBSCRIPT.fullmatch(name)
+            letter, index = (short[1], short[2] or short[3]) if short else (name, "")
+            written = self._element("mi", greek_unicode.get(letter, letter))
+            if dots:
+                mark = self._element("mo", "˙" if dots == 1 else "¨")
+                written = self._element("mpadded", self._element("mover", written, mark))
+                written.setAttribute("height", HEIGHT)
+            digits = "mn" if index.isdigit() else "mi"
+            return self._element("msub", written, self._element(digits, index)) if index else written
+
+        def _print_Pow(self, e: Any) -> Any:
+            written = super()._print_Pow(e)
+            if written.tagName == "msup" and written.firstChild.tagName == "msub":
+                return self._element("msubsup", *written.firstChild.childNodes[:], written.lastChild)
+            return written
 
     names: dict[Any, Any] = {}
     for rate in expression.atoms(sympy.Derivative):
@@ -104,9 +125,24 @@ def mathml(expression: Any, behind: str = "") -> str:
     expression = expression.xreplace(names)
     names = {place: sympy.Symbol(place.func.__name__) for place in expression.atoms(AppliedUndef)}
     # Products of names need a sign between them.
-    written = Printer({"mul_symbol": "dot"}).doprint(expression.xreplace(names))
-    text = f"<mtext>{escape(behind)}</mtext>" if behind else ""
-    return (
-        '<div style="overflow-x: auto"><math xmlns="http://www.w3.org/1998/Math/MathML">'
-        f"<mrow>{written}{text}</mrow></math></div>"
-    )
+    expression = expression.xreplace(names)
+    written = Printer({"mul_symbol": "dot"})._print(expression)
+    parts = [""]
+    for child in written.childNodes if expression.is_Add else [written]:
+        if child.nodeName == "mo" and parts != [""]:
+            parts.append("")
+        parts[-1] += child.toxml()
+    if behind:
+        parts[-1] += f"<mtext>{escape(behind).replace(' ', NO_BREAK)}</mtext>"
+    return f'<div style="overflow-x: auto">{wrapped_mathml(parts)}</div>'
+
+
+def wrapped_mathml(parts: Sequence[str]) -> str:
+    """Return the parts of a formula, in MathML, as formulas between which a line may end.
+
+    Browsers do not break formulas. A part that is not the first begins with its operator.
+    """
+    head = '<math xmlns="http://www.w3.org/1998/Math/MathML" displaystyle="true">'
+    first, *others = parts
+    others = [re.sub(r"^<mo\b", '<mo form="infix"', part) for part in others]
+    return "\n".join(f"{head}<mrow>{part}</mrow></math>" for part in (first, *others))

@@ -97,6 +97,7 @@ class AcrobotExact(Task):
         **_ANGLES,
         "theta_1_dot": ("rad/s", "angular velocity of the first link, clipped at 4π"),
         "theta_2_dot": ("rad/s", "that of the second link relative to it, clipped at 9π"),
+        "elbow_torque": ("N m", "torque at the elbow"),
     }
     scene: Any = Acrobot
     defaults = {"inertia_1": 1.0, "inertia_2": 1.0, "gravity": 9.8}
@@ -252,6 +253,8 @@ class AcrobotReal(Task):
         **_ANGLES,
         "theta_1_dot/10": ("rad/s", "angular velocity of the first link, divided by 10"),
         "theta_2_dot/20": ("rad/s", "that of the second link relative to it, divided by 20"),
+        "shoulder_torque": ("N m", "torque at the shoulder"),
+        "elbow_torque": ("N m", "torque at the elbow"),
     }
     scene: Any = Acrobot
     #: Inertias about the centres of mass; the source gives 0.031887199591513114 and 0.05086984812807257 kg m²

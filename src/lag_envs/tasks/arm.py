@@ -72,6 +72,8 @@ class Reach(Task):
         "theta_2_dot/10": ("rad/s", "angular velocity of the forearm relative to it, divided by 10"),
         "goal_x": ("m", "place of the point to reach, to the right of the shoulder"),
         "goal_y": ("m", "its height above the shoulder"),
+        "shoulder": ("N m", "torque at the shoulder"),
+        "elbow": ("N m", "torque at the elbow"),
     }
     scene: Any = TwoLinkArm
     defaults = {"damping": 0.05}

@@ -116,7 +116,7 @@ class Task:
     note : str
         A text about its agents for docs/agents.md, without numbers, which are in the tables.
     quantities : mapping
-        For entries of the observation (unit, meaning), as the environment's page has them.
+        For entries of the observation and for controls (unit, meaning), as the environment's page has them.
 
     Parameters
     ----------

@@ -114,7 +114,7 @@ class CartPoleExact(_OnTrack):
 
     id = "CartPoleExact-v0"
     peer = "CartPole-v1"
-    quantities = _STATE
+    quantities = {**_STATE, "force": ("N", "force on the cart")}
     action = {"force": [-10.0, 10.0]}
     start = dict.fromkeys(_STATE, 0.05)
     unbounded = math.inf
@@ -239,6 +239,7 @@ class CartPoleContinuous(_OnTrack):
         "x_dot/2": ("m/s", "its speed, halved"),
         "theta/0.21": ("rad", "angle of the pole, divided by 12 degrees"),
         "theta_dot/2": ("rad/s", "its angular velocity, halved"),
+        "force": ("N", "force on the cart"),
     }
     action = {"force": 10.0}
     start = {"x": 1.0, "x_dot": 0.1, "theta": 0.1, "theta_dot": 0.2}
@@ -378,6 +379,7 @@ class CartPoleSwingUp(_OnTrack):
         "cos(theta)": ("1", "cosine of the pole's angle, 1 upright"),
         "sin(theta)": ("1", "its sine"),
         "theta_dot/8": ("rad/s", "its angular velocity, divided by 8"),
+        "force": ("N", "force on the cart"),
     }
     action = {"force": 10.0}
     start = {"x": 0.2, "x_dot": 0.1, "theta": (math.pi, 0.05), "theta_dot": 0.1}

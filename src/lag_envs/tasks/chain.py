@@ -215,6 +215,7 @@ because all starts are close together. SAC and TD3 learn from fewer steps than t
         return {
             "s/S": ("1", "place of the support, divided by the track's half length S"),
             "s_dot/2": ("m/s", "speed of the support, halved"),
+            "s_ddot": ("m/s²", "acceleration of the support"),
             **{f"cos({name})": ("1", f"cosine of {name}") for name in self.angles},
             **{f"sin({name})": ("1", f"sine of {name}") for name in self.angles},
             **{f"{name}_dot/8": ("rad/s", f"rate of {name}, divided by 8") for name in self.angles},
@@ -659,6 +660,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
         return {
             "s": ("m", "place of the support"),
             "s_dot": ("m/s", "its speed"),
+            "s_ddot": ("m/s²", "acceleration of the support"),
             **{
                 f"e_{i + 1}": ("rad", f"angle from upright, {name} - π") for i, name in enumerate(self.angles)
             },

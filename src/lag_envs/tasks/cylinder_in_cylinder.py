@@ -19,7 +19,11 @@ _PPO = {"gamma": 0.98, "gae_lambda": 0.95}
 
 #: The observed quantities with their units.
 _ROLLING = {"theta": ("rad", "angle of the small cylinder's axis"), "theta_dot": ("rad/s", "its rate")}
-_SHELL = {**_ROLLING, "psi_dot": ("rad/s", "rate of the shell")}
+_SHELL = {
+    **_ROLLING,
+    "psi_dot": ("rad/s", "rate of the shell"),
+    "psi_ddot": ("rad/s²", "acceleration of the shell"),
+}
 
 
 class _Shell(Task):
@@ -473,7 +477,7 @@ class Damping(Task):
     """
 
     id = "CylinderInCylinderDamping-v0"
-    quantities = _ROLLING
+    quantities = {**_ROLLING, "drag": ("N m s", "coefficient of the brake")}
     scene: Any = CylinderInCylinder
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
     usable = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell

@@ -98,6 +98,7 @@ class Tilt(Task):
         "x": ("m", "place along the plane"),
         "w": ("m/s", "x' + R φ', the speed proportional to the momentum"),
         "phi": ("rad", "tilt"),
+        "phi_dot": ("rad/s", "rate of the tilt"),
         "target": ("m", "the mark x*"),
     }
     scene: Any = Incline
@@ -346,6 +347,7 @@ class Brake(Task):
     quantities = {
         "distance": ("m", "distance to the line, -x"),
         "v": ("m/s", "speed x' down the slope"),
+        "drag": ("N s/m", "coefficient of the brake"),
     }
     scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}

@@ -121,6 +121,7 @@ class PendulumExact(_Rod):
     quantities = {
         **_Rod.direction,
         "theta_dot": ("rad/s", "angular velocity, clipped at 8"),
+        "torque": ("N m", "torque at the pivot"),
     }
     defaults = {"gravity": 10.0}
     largest_action = 2.0
@@ -260,6 +261,7 @@ class PendulumRegret(_Rod):
     quantities = {
         **_Rod.direction,
         "theta_dot/8": ("rad/s", "angular velocity, divided by 8"),
+        "torque": ("N m", "torque at the pivot"),
     }
     scaled = False
     start = {"theta": (math.pi, 0.2), "theta_dot": 0.2}

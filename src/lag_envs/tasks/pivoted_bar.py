@@ -111,6 +111,7 @@ class SwingUp(GuardedTrack, _Bar):
     quantities = {
         "s/S": ("1", "place of the support, divided by the track's half length S"),
         "s_dot/2": ("m/s", "speed of the support, halved"),
+        "s_ddot": ("m/s²", "acceleration of the support"),
         "cos(theta)": ("1", "cosine of the bar's angle"),
         "sin(theta)": ("1", "its sine"),
         "theta_dot/8": ("rad/s", "angular velocity, divided by 8"),
@@ -432,6 +433,7 @@ class Balance(_Bar):
     quantities = {
         "s": ("m", "place of the support"),
         "s_dot": ("m/s", "its speed"),
+        "s_ddot": ("m/s²", "acceleration of the support"),
         "e": ("rad", "angle from upright, θ - π"),
         "theta_dot": ("rad/s", "angular velocity"),
     }

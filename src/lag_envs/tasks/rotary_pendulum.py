@@ -68,6 +68,7 @@ class RotarySwingUp(Task):
         "cos(theta)": ("1", "cosine of the pendulum's angle, 1 hanging"),
         "sin(theta)": ("1", "its sine"),
         "theta_dot/20": ("rad/s", "its angular velocity, divided by 20"),
+        "torque": ("N m", "torque on the arm"),
     }
     scene: Any = RotaryPendulum
     defaults = {"arm_inertia": 2e-3, "inertia": 7.5e-4, "arm_damping": 5e-4, "damping": 1e-4}

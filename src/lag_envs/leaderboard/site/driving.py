@@ -100,7 +100,14 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
         "noise": program.noise,
         "delay": program.delay,
         "controls": [
-            {"name": a.control, "unit": units[a.control], "low": a.low, "high": a.high, "values": a.values}
+            {
+                "name": a.control,
+                "unit": units[a.control],
+                "meaning": task.quantities.get(a.control, ("", None))[1],
+                "low": a.low,
+                "high": a.high,
+                "values": a.values,
+            }
             for a in formulas.acting
         ],
         "largest": formulas.largest,

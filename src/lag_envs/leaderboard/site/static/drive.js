@@ -11,33 +11,75 @@
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
   // --- random numbers --------------------------------------------------------------------------------------
-  // The same as lag_envs/stepping/primitives.py: SplitMix64's mix of key, step and index, in 64 bits.
+  // The same as lag_envs/stepping/primitives.py: SplitMix64's mix of key, step and index, in 64 bits. A word is
+  // kept as its two unsigned halves, since each BigInt would be garbage; results are left in `high` and `low`.
 
   const big = (x) => BigInt(x);
   const BITS = 64;
-  const word = (x) => BigInt.asUintN(BITS, x);
-  const [GOLDEN, FIRST, SECOND] = ["0x9E3779B97F4A7C15", "0xBF58476D1CE4E5B9", "0x94D049BB133111EB"].map(big);
+  const HALF = 2 ** 32;
   const PER_STEP = 16;
-  const [S30, S27, S31, S11, DRAWS, ONE] = [30, 27, 31, 11, PER_STEP, 1].map(big);
   /** Keys of draws that are not the episode's own, as lag_envs/envs/imperfect/draws.py has them. */
-  const PURPOSES = { parameters: big(1), observation: big(2) };
+  const PURPOSES = { parameters: 1, observation: 2 };
+  let [high, low] = [0, 0];
 
-  function mixed(z) {
-    z = word((z ^ (z >> S30)) * FIRST);
-    z = word((z ^ (z >> S27)) * SECOND);
-    return z ^ (z >> S31);
+  /** The product of two words, modulo 2^64. */
+  function multiply(aHigh, aLow, bHigh, bLow) {
+    const a0 = aLow & 0xffff;
+    const a1 = aLow >>> 16;
+    const b0 = bLow & 0xffff;
+    const b1 = bLow >>> 16;
+    const first = a0 * b0;
+    const second = a1 * b0 + (first >>> 16);
+    const third = a0 * b1 + (second & 0xffff);
+    low = ((third << 16) | (first & 0xffff)) >>> 0;
+    high = (a1 * b1 + (second >>> 16) + (third >>> 16) + Math.imul(aHigh, bLow) + Math.imul(aLow, bHigh)) >>> 0;
   }
 
-  const episodeKey = (key, episode) => mixed(word(mixed(key) + episode * GOLDEN));
+  /** The word, with its upper bits also further down. */
+  function fold(by) {
+    low = (low ^ ((low >>> by) | (high << (32 - by)))) >>> 0;
+    high = (high ^ (high >>> by)) >>> 0;
+  }
+
+  function mix() {
+    fold(30);
+    multiply(high, low, 0xbf58476d, 0x1ce4e5b9);
+    fold(27);
+    multiply(high, low, 0x94d049bb, 0x133111eb);
+    fold(31);
+  }
+
+  /** The mix of a key and a multiple of the golden ratio. */
+  function stir(keyHigh, keyLow, n) {
+    multiply(Math.floor(n / HALF), n >>> 0, 0x9e3779b9, 0x7f4a7c15);
+    const sum = low + keyLow;
+    low = sum >>> 0;
+    high = (high + keyHigh + (sum >= HALF ? 1 : 0)) >>> 0;
+    mix();
+  }
+
+  /** The key of an episode, as its two halves. */
+  function episodeKey(key, episode) {
+    [high, low] = key;
+    mix();
+    stir(high, low, episode);
+    return [high, low];
+  }
+
+  const halves = (word) => [Number(big(word) >> big(32)), Number(BigInt.asUintN(32, big(word)))];
 
   /** Draw `index` of step `step`, in [0, 1). */
   function uniform(key, step, index) {
-    return Number(mixed(word(key + (big(step) * DRAWS + big(index) + ONE) * GOLDEN)) >> S11) * 2 ** -53;
+    stir(key[0], key[1], step * PER_STEP + index + 1);
+    return (high * 2 ** 21 + (low >>> 11)) * 2 ** -53;
   }
 
   // --- episodes --------------------------------------------------------------------------------------------
 
-  /** An environment, stepped by the printed functions. */
+  /** Room for the poses of all frames, [x, y, angle, part] each. */
+  const roomOf = ({ frames }) => Array.from({ length: frames }, () => [0, 0, 0, 0]);
+
+  /** An environment, stepped by the printed functions. A step makes no arrays: garbage costs more than the step. */
   class Episode {
     constructor(code, seed, constants = code.constants) {
       const { about } = code;
@@ -45,33 +87,44 @@
       this.k = Float64Array.from(constants);
       this.f = new Float64Array(about.size);
       this.kept = new Float64Array(about.size);
+      this.p = new Float64Array(4 * about.frames);
+      this.d = new Float64Array(Math.max(about.starts, about.draws, about.drawn, about.noise));
+      this.o = this.part("o");
+      this.state = this.f.subarray(0, about.states);
+      /** What agents see: the observation in float32. */
+      this.seen = new Float64Array(this.o.length);
+      this.waiting = Array.from({ length: about.delay + 1 }, () => new Float64Array(about.rest.length));
       this.restart(seed);
     }
 
     restart(seed) {
       const { functions, about } = this.code;
-      this.key = episodeKey(big(seed), ONE);
+      this.key = episodeKey(halves(seed), 1);
+      this.noise = episodeKey(this.key, PURPOSES.observation);
       [this.steps, this.total, this.over] = [0, 0, ""];
-      this.waiting = Array(about.delay).fill(about.rest);
+      for (const action of this.waiting) action.set(about.rest);
       if (about.drawn) {
-        functions.draw(this.k, this.draws(about.drawn, "parameters"));
+        functions.draw(this.k, this.draws(about.drawn, episodeKey(this.key, PURPOSES.parameters), 0));
         functions.derive(this.k);
       }
-      functions.start(this.f, this.draws(about.starts), this.k);
+      functions.start(this.f, this.draws(about.starts, this.key, 0), this.k);
       this.observe();
     }
 
-    /** Draws of this step, from the episode's own key or that of a purpose. */
-    draws(count, purpose) {
-      const key = purpose ? episodeKey(this.key, PURPOSES[purpose]) : this.key;
-      const step = purpose ? this.steps * Math.ceil(count / PER_STEP) : this.steps;
-      return Float64Array.from({ length: count }, (_, i) => uniform(key, step, i));
+    /** Draws of a step. */
+    draws(count, key, step) {
+      for (let i = 0; i < count; i++) this.d[i] = uniform(key, step, i);
+      return this.d;
     }
 
     observe() {
       const { functions, about } = this.code;
       functions.observe(this.f, this.k);
-      functions.sense?.(this.f, this.draws(about.noise, "observation"), this.k);
+      if (functions.sense) {
+        const step = this.steps * Math.ceil(about.noise / PER_STEP);
+        functions.sense(this.f, this.draws(about.noise, this.noise, step), this.k);
+      }
+      for (let i = 0; i < this.seen.length; i++) this.seen[i] = Math.fround(this.o[i]);
     }
 
     /** Hold an action for one interval; returns the reward. Afterwards `over` says how it ended, if it did. */
@@ -79,18 +132,19 @@
       const { functions, about } = this.code;
       const { rows } = about;
       this.kept.set(this.f);
-      this.waiting.push(action);
-      functions.move(this.f, this.waiting.shift(), this.k);
+      const many = this.waiting.length;
+      this.waiting[this.steps % many].set(action);
+      functions.move(this.f, this.waiting[(this.steps + 1) % many], this.k);
       if (this.f[rows.refused] > 0) {
         this.f.set(this.kept);
         this.over = "refused";
         return 0;
       }
-      this.steps += 1;
       const reward = this.f[rows.reward];
       this.total += reward;
       const ended = this.f[rows.ended] > 0;
-      if (about.draws) functions.kick(this.f, this.draws(about.draws), this.k);
+      this.steps += 1;
+      if (about.draws) functions.kick(this.f, this.draws(about.draws, this.key, this.steps), this.k);
       this.observe();
       this.over = ended ? "terminated" : about.limit !== null && this.steps >= about.limit ? "truncated" : "";
       return reward;
@@ -100,16 +154,12 @@
       return this.f.subarray(...this.code.about.rows[name]);
     }
 
-    get state() {
-      return this.f.subarray(0, this.code.about.states);
-    }
-
-    /** Where the frames are, [x, y, angle, part] each. */
-    poses() {
-      const { functions, about } = this.code;
-      const p = new Float64Array(4 * about.frames);
-      functions.poses(this.f, p, this.k);
-      return Array.from({ length: about.frames }, (_, i) => [...p.subarray(4 * i, 4 * i + 4)]);
+    /** Where the frames are, written into `room`. */
+    poses(room = roomOf(this.code.about)) {
+      const { functions } = this.code;
+      functions.poses(this.f, this.p, this.k);
+      for (let i = 0; i < this.p.length; i++) room[i >> 2][i & 3] = this.p[i];
+      return room;
     }
   }
 
@@ -205,7 +255,7 @@
     if (fields.length !== 7 || check !== crc32(fields.slice(0, 6).join("~"))) {
       throw new Error("The link is damaged; copy all of it again.");
     }
-    if (id !== about.id) throw new Error(`The link belongs to another environment, ${id.slice(0, 60)}.`);
+    if (id !== about.id) throw Object.assign(new Error(`The link belongs to another environment, ${id.slice(0, 60)}.`), { id });
     if (!/^(0|[1-9]\d{0,19})$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed) || packed.length % 4 === 1) {
       throw new Error("The link is forged: a field is not what it must be.");
     }
@@ -240,91 +290,143 @@
     );
     const kinds = { mlp, gru, linear: feedback, plan, "action table": table, "value table": table };
     const numbers = kinds[about.kind](about, arrays);
-    return (episode) => actionsFrom(numbers(episode), about);
-  }
-
-  /** Numbers as an action: clipped in a range; in a list, the largest number chooses. */
-  function actionsFrom(numbers, { choices, largest }) {
-    if (!choices.length) return Array.from(numbers, (x) => Math.fround(clamp(x, -largest, largest)));
-    let end = 0;
-    return choices.map((count) => indexOfLargest(numbers.slice(end, (end += count))));
-  }
-
-  const indexOfLargest = (x) => x.reduce((best, v, i) => (v > x[best] ? i : best), 0);
-
-  /** What an agent sees, in float32. */
-  const seen = (episode) => Float64Array.from(episode.part("o"), Math.fround);
-
-  /** State and target that an agent reads from what it sees, as ObservationDecoder does. */
-  function reader({ zero, inverse, states, width, pairs }) {
+    let action = null;
     return (episode) => {
-      const lifted = inverse[0].map(() => 0);
-      seen(episode).forEach((o, i) => inverse[i].forEach((x, j) => (lifted[j] += (o - zero[i]) * x)));
-      const state = lifted.slice(0, states);
-      for (const [i, j] of pairs) state[i] = Math.atan2(lifted[j + 1], lifted[j]);
-      return [state, lifted[width]];
+      action ??= new Float64Array(episode.code.about.rest.length);
+      return actionsFrom(numbers(episode), about, action);
     };
   }
 
-  const affine = (x, weight, bias) =>
-    Float64Array.from(bias.n, (start, row) => x.reduce((sum, v, i) => sum + v * weight.n[row * x.length + i], start));
+  /** Numbers as an action: clipped in a range; in a list, the largest number chooses. The array is used again. */
+  function actionsFrom(numbers, { choices, largest }, action) {
+    if (!choices.length) {
+      for (let i = 0; i < action.length; i++) action[i] = Math.fround(clamp(numbers[i], -largest, largest));
+      return action;
+    }
+    for (let i = 0, end = 0; i < choices.length; i++) action[i] = largestOf(numbers, end, (end += choices[i]));
+    return action;
+  }
+
+  /** The place of the largest number of a part, counted from its beginning. */
+  function largestOf(x, from = 0, to = x.length) {
+    let best = from;
+    for (let i = from + 1; i < to; i++) if (x[i] > x[best]) best = i;
+    return best - from;
+  }
+
+  /** State and target that an agent reads from what it sees, as ObservationDecoder does. */
+  function reader({ zero, inverse, states, width, pairs }) {
+    const wide = inverse[0].length;
+    const lifted = new Float64Array(wide);
+    const read = { state: new Float64Array(states), target: 0 };
+    return ({ seen }) => {
+      lifted.fill(0);
+      for (let i = 0; i < seen.length; i++) {
+        for (let j = 0; j < wide; j++) lifted[j] += (seen[i] - zero[i]) * inverse[i][j];
+      }
+      for (let i = 0; i < states; i++) read.state[i] = lifted[i];
+      for (let n = 0; n < pairs.length; n++) read.state[pairs[n][0]] = Math.atan2(lifted[pairs[n][1] + 1], lifted[pairs[n][1]]);
+      read.target = lifted[width];
+      return read;
+    };
+  }
+
+  /** A layer without its activation, into an array of its own. */
+  function affine(weight, bias) {
+    const [factors, starts] = [weight.n, bias.n];
+    const out = new Float64Array(starts.length);
+    return (x) => {
+      for (let row = 0, at = 0; row < out.length; row++) {
+        let sum = starts[row];
+        for (let i = 0; i < x.length; i++) sum += x[i] * factors[at++];
+        out[row] = sum;
+      }
+      return out;
+    };
+  }
+
+  /** Change all numbers of an array. */
+  function apply(x, change) {
+    for (let i = 0; i < x.length; i++) x[i] = change(x[i]);
+    return x;
+  }
 
   /** Observations as a network's input. */
   function normaliser({ normalise }, { obs_mean: mean, obs_var: variance }) {
     if (!normalise) return (x) => x;
     const { epsilon, clip } = normalise;
-    return (x) => x.map((v, i) => clamp((v - mean.n[i]) / Math.sqrt(variance.n[i] + epsilon), -clip, clip));
+    const out = new Float64Array(mean.n.length);
+    return (x) => {
+      for (let i = 0; i < out.length; i++) out[i] = clamp((x[i] - mean.n[i]) / Math.sqrt(variance.n[i] + epsilon), -clip, clip);
+      return out;
+    };
   }
 
   /** The output of a network's layers. */
   function layers(about, arrays) {
-    const { activation, bins, choices, controls, largest, mean_limit: limit } = about;
+    const { bins, choices, controls, largest, mean_limit: limit } = about;
+    const activation = ACTIVATIONS[about.activation];
+    const all = Array.from({ length: about.layers }, (_, k) => affine(arrays[`weight_${k}`], arrays[`bias_${k}`]));
+    const out = new Float64Array(controls);
+    const limited = (v) => clamp(v, -limit, limit);
+    const squashed = (v) => largest * Math.tanh(v);
     return (x) => {
-      for (let k = 0; k < about.layers; k++) {
-        x = affine(x, arrays[`weight_${k}`], arrays[`bias_${k}`]);
-        if (k + 1 < about.layers) x = x.map(ACTIVATIONS[activation]);
+      for (let k = 0; k < all.length; k++) {
+        x = all[k](x);
+        if (k + 1 < all.length) apply(x, activation);
       }
       if (choices.length) return x;
       if (bins) {
-        return Array.from({ length: controls }, (_, i) =>
-          largest * ((2 * indexOfLargest(x.subarray(i * bins, (i + 1) * bins)) + 1) / bins - 1));
+        for (let i = 0; i < controls; i++) out[i] = largest * ((2 * largestOf(x, i * bins, (i + 1) * bins) + 1) / bins - 1);
+        return out;
       }
-      if (limit) x = x.map((v) => clamp(v, -limit, limit));
-      return about.squash === "tanh" ? x.map((v) => largest * Math.tanh(v)) : x;
+      if (limit) apply(x, limited);
+      return about.squash === "tanh" ? apply(x, squashed) : x;
     };
   }
 
   function mlp(about, arrays) {
     const [normalised, outputs] = [normaliser(about, arrays), layers(about, arrays)];
-    let frames;
-    return (episode) => {
-      const now = seen(episode);
-      if (!episode.steps) frames = Array(about.frames).fill(about.padding === "first" ? now : now.map(() => 0));
-      frames = [...frames.slice(1), now];
-      return outputs(normalised(Float64Array.from(frames.flatMap((x) => [...x]))));
+    let frames = null;
+    return ({ seen, steps }) => {
+      const wide = seen.length;
+      frames ??= new Float64Array(about.frames * wide);
+      if (!steps) {
+        frames.fill(0);
+        if (about.padding === "first") for (let at = 0; at < frames.length; at += wide) frames.set(seen, at);
+      }
+      frames.copyWithin(0, wide);
+      frames.set(seen, frames.length - wide);
+      return outputs(normalised(frames));
     };
   }
 
   function gru(about, arrays) {
     const [normalised, outputs] = [normaliser(about, arrays), layers(about, arrays)];
+    const [input, hidden] = [affine(arrays.weight_ih, arrays.bias_ih), affine(arrays.weight_hh, arrays.bias_hh)];
     const size = about.memory;
-    let memory;
-    return (episode) => {
-      if (!episode.steps) memory = new Float64Array(size);
-      const o = affine(normalised(seen(episode)), arrays.weight_ih, arrays.bias_ih);
-      const h = affine(memory, arrays.weight_hh, arrays.bias_hh);
-      memory = memory.map((old, i) => {
-        const [r, z] = [0, size].map((at) => sigmoid(o[at + i] + h[at + i]));
-        return (1 - z) * Math.tanh(o[2 * size + i] + r * h[2 * size + i]) + z * old;
-      });
+    const memory = new Float64Array(size);
+    return ({ seen, steps }) => {
+      if (!steps) memory.fill(0);
+      const [o, h] = [input(normalised(seen)), hidden(memory)];
+      for (let i = 0; i < size; i++) {
+        const r = sigmoid(o[i] + h[i]);
+        const z = sigmoid(o[size + i] + h[size + i]);
+        memory[i] = (1 - z) * Math.tanh(o[2 * size + i] + r * h[2 * size + i]) + z * memory[i];
+      }
       return outputs(memory);
     };
   }
 
   function feedback(about, { gain, offset }) {
-    return (episode) => {
-      const x = seen(episode);
-      return Float64Array.from(offset.n, (start, j) => x.reduce((sum, v, i) => sum + v * gain.n[i * offset.n.length + j], start));
+    const out = new Float64Array(offset.n.length);
+    return ({ seen }) => {
+      for (let j = 0; j < out.length; j++) {
+        let sum = offset.n[j];
+        for (let i = 0; i < seen.length; i++) sum += seen[i] * gain.n[i * out.length + j];
+        out[j] = sum;
+      }
+      return out;
     };
   }
 
@@ -339,12 +441,18 @@
     const read = reader(about.read);
     const wrapped = about.read.pairs.map(([i]) => i);
     const [[length, wide], many] = [states.shape, actions.shape[1]];
+    const [off, out] = [new Float64Array(wide), new Float64Array(many)];
     return (episode) => {
       const now = Math.min(episode.steps, length - 1);
-      const off = read(episode)[0].map((x, i) => x - states.n[now * wide + i]);
+      const { state } = read(episode);
+      for (let i = 0; i < wide; i++) off[i] = state[i] - states.n[now * wide + i];
       for (const i of wrapped) off[i] -= 2 * Math.PI * rounded(off[i] / (2 * Math.PI));
-      return Array.from({ length: many }, (_, j) =>
-        actions.n[now * many + j] - off.reduce((sum, x, i) => sum + gains.n[(now * many + j) * wide + i] * x, 0));
+      for (let j = 0; j < many; j++) {
+        let sum = 0;
+        for (let i = 0; i < wide; i++) sum += gains.n[(now * many + j) * wide + i] * off[i];
+        out[j] = actions.n[now * many + j] - sum;
+      }
+      return out;
     };
   }
 
@@ -354,67 +462,97 @@
     const read = reader(about.read);
     const strides = axes.map((_, j) => axes.slice(j + 1).reduce((product, axis) => product * axis.length, 1));
 
-    /** The table's number at a moment, and whether it is from the mirror image. */
+    const [given, points] = [new Float64Array(about.sums[0].length), new Float64Array(axes.length)];
+    const [cells, places] = [new Int32Array(axes.length), new Float64Array(axes.length)];
+    let mirrored = false;
+
+    /** The table's number at a moment; `mirrored` says whether it is from the mirror image. */
     function lookUp(state, target, steps) {
-      const given = [...state, target, steps * about.interval];
+      given.set(state);
+      given[state.length] = target;
+      given[state.length + 1] = steps * about.interval;
       for (const [i] of about.read.pairs) given[i] -= 2 * Math.PI * Math.round(given[i] / (2 * Math.PI));
-      const points = about.sums.map((row) => row.reduce((sum, s, i) => sum + (s ? s * given[i] : 0), 0));
-      const mirrored = about.mirror !== null && points[about.mirror] < 0;
-      const cells = points.map((x, j) => {
-        const [axis, at] = [axes[j], mirrored && about.axes[j] !== "time" ? -x : x];
+      for (let j = 0; j < axes.length; j++) {
+        points[j] = 0;
+        for (let i = 0; i < given.length; i++) if (about.sums[j][i]) points[j] += about.sums[j][i] * given[i];
+      }
+      mirrored = about.mirror !== null && points[about.mirror] < 0;
+      for (let j = 0; j < axes.length; j++) {
+        const [axis, at] = [axes[j], mirrored && about.axes[j] !== "time" ? -points[j] : points[j]];
         let cell = 0;
-        for (let high = axis.length - 1; high - cell > 1;) {
-          const middle = (cell + high) >> 1;
+        for (let end = axis.length - 1; end - cell > 1;) {
+          const middle = (cell + end) >> 1;
           if (axis[middle] <= at) cell = middle;
-          else high = middle;
+          else end = middle;
         }
-        return [cell, clamp((at - axis[cell]) / (axis[cell + 1] - axis[cell]), 0, 1)];
-      });
+        cells[j] = cell;
+        places[j] = clamp((at - axis[cell]) / (axis[cell + 1] - axis[cell]), 0, 1);
+      }
       let total = 0;
-      for (let corner = 0; corner < 1 << cells.length; corner++) {
+      for (let corner = 0; corner < 1 << axes.length; corner++) {
         let [weight, index] = [1, 0];
-        cells.forEach(([cell, place], j) => {
+        for (let j = 0; j < axes.length; j++) {
           const upper = (corner >> j) & 1;
-          weight *= upper ? place : 1 - place;
-          index += (cell + upper) * strides[j];
-        });
+          weight *= upper ? places[j] : 1 - places[j];
+          index += (cells[j] + upper) * strides[j];
+        }
         if (weight) total += weight * values[index];
       }
-      return [total, mirrored];
+      return total;
     }
 
+    const out = [0];
     if (about.kind === "action table") {
       return (episode) => {
-        const [found, mirrored] = lookUp(...read(episode), episode.steps);
-        return [mirrored ? about.sign * found : found];
+        const { state, target } = read(episode);
+        const found = lookUp(state, target, episode.steps);
+        out[0] = mirrored ? about.sign * found : found;
+        return out;
       };
     }
 
+    const tried = [0];
+    let before = null;
+    let after = null;
+
     /** The values of actions: the reward of a step from the observed state, plus the value where it ends. */
-    function worth(episode, actions) {
+    function worth(episode, actions, found) {
       const { functions, about: code } = episode.code;
-      const [state, target] = read(episode);
-      const before = Float64Array.from(episode.f);
+      const { state, target } = read(episode);
+      before ??= new Float64Array(episode.f.length);
+      after ??= new Float64Array(episode.f.length);
+      before.set(episode.f);
       before.set(state);
-      before.fill(target, ...code.rows.g);
+      before.fill(target, code.rows.g[0], code.rows.g[1]);
       functions.lift(before, episode.k);
-      const after = new Float64Array(before.length);
-      return actions.map((action) => {
+      for (let i = 0; i < actions.length; i++) {
         after.set(before);
-        functions.move(after, [action], episode.k);
-        const later = after[code.rows.ended] > 0 ? 0 : lookUp(after.subarray(0, code.states), target, episode.steps + 1)[0];
-        return after[code.rows.reward] + later;
-      });
+        tried[0] = actions[i];
+        functions.move(after, tried, episode.k);
+        for (let j = 0; j < next.length; j++) next[j] = after[j];
+        found[i] = after[code.rows.reward];
+        if (!(after[code.rows.ended] > 0)) found[i] += lookUp(next, target, episode.steps + 1);
+      }
+      return found;
     }
 
     const { choices, largest } = about;
-    if (choices.length) return (episode) => worth(episode, [...Array(choices[0]).keys()]);
+    const next = new Float64Array(about.read.states);
+    const roomFor = (n) => [new Float64Array(n), new Float64Array(n)];
+    if (choices.length) {
+      const [actions, found] = roomFor(choices[0]);
+      for (let i = 0; i < choices[0]; i++) actions[i] = i;
+      return (episode) => worth(episode, actions, found);
+    }
     const spaced = (n) => Array.from({ length: n }, (_, i) => -1 + (2 * i) / (n - 1));
-    const best = (episode, actions) => actions[indexOfLargest(worth(episode, actions))];
+    const coarse = spaced(about.actions).map((x) => largest * x);
+    const fine = spaced(17).map((x) => ((2 * largest) / (about.actions - 1)) * x);
+    const [near, values1, values2] = [new Float64Array(17), new Float64Array(coarse.length), new Float64Array(17)];
     return (episode) => {
-      const coarse = best(episode, spaced(about.actions).map((x) => largest * x));
-      const width = (2 * largest) / (about.actions - 1);
-      return [best(episode, spaced(17).map((x) => clamp(coarse + width * x, -largest, largest)))];
+      const middle = coarse[largestOf(worth(episode, coarse, values1))];
+      for (let i = 0; i < 17; i++) near[i] = clamp(middle + fine[i], -largest, largest);
+      out[0] = near[largestOf(worth(episode, near, values2))];
+      return out;
     };
   }
 
@@ -422,6 +560,7 @@
 
   const PAIRS = [["ArrowLeft", "ArrowRight"], ["ArrowDown", "ArrowUp"], ["a", "d"], ["s", "w"]];
   const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowDown: "↓", ArrowUp: "↑" };
+  const SPOKEN = { ArrowLeft: "left arrow", ArrowRight: "right arrow", ArrowDown: "down arrow", ArrowUp: "up arrow" };
   const nameOf = (key) => NAMES[key] ?? key.toUpperCase();
 
   /** Keys, pointer and gamepad as numbers per control. */
@@ -429,8 +568,9 @@
     constructor(about, lost) {
       [this.about, this.lost] = [about, lost];
       this.pressed = new Set();
-      this.pointer = null;
+      [this.pointer, this.finger] = [null, null];
       this.pad = null;
+      this.held = {};
     }
 
     get pairs() {
@@ -439,18 +579,33 @@
 
     release() {
       this.pressed.clear();
-      this.pointer = null;
+      [this.pointer, this.finger] = [null, null];
+    }
+
+    /** The gamepad; null without one. */
+    gamepad() {
+      if (this.pad === null) return null;
+      const pad = navigator.getGamepads?.()[this.pad];
+      if (pad?.connected) return pad;
+      this.pad = null;
+      this.lost();
+      return null;
+    }
+
+    /** What has just been pressed on the gamepad: A or Start, B, or the stick after it was at rest. */
+    pressedOnPad() {
+      const pad = this.gamepad();
+      if (!pad) return {};
+      const held = (i) => Boolean(pad.buttons[i]?.pressed);
+      const before = this.held;
+      this.held = { go: held(0) || held(9), again: held(1), stick: this.readPad() !== null };
+      return Object.fromEntries(Object.entries(this.held).map(([name, now]) => [name, now && before[name] === false]));
     }
 
     /** The gamepad's input, [-1, 1] per axis; null without one, or if it is not touched. */
     readPad() {
-      if (this.pad === null) return null;
-      const pad = navigator.getGamepads?.()[this.pad];
-      if (!pad?.connected) {
-        this.pad = null;
-        this.lost();
-        return null;
-      }
+      const pad = this.gamepad();
+      if (!pad) return null;
       const button = (i) => (pad.buttons[i]?.pressed ? 1 : 0);
       const axes = [0, 1, 2, 3].map((i) => (Math.abs(pad.axes[i] ?? 0) > 0.12 ? pad.axes[i] : 0) * (i % 2 ? -1 : 1));
       axes[0] += button(15) - button(14);
@@ -481,6 +636,8 @@
 
   /** Steps after which a browser has compiled a scene's code. */
   const WARM = 300;
+  /** The farthest that a finger moves in a tap [px]. */
+  const TAP = 10;
   const idly = globalThis.requestIdleCallback?.bind(globalThis) ?? ((work) => setTimeout(work, 20));
 
   const LACKING = [
@@ -507,7 +664,7 @@
 
   /** Build the driver into an element and return it. */
   function open(root, board, code, tools) {
-    const { make, find, text, symbol, fit, paint, placed, windowOf, posesAt, load, calm } = tools;
+    const { make, all, text, symbol, fit, paint, placed, apart, windowOf, posesAt, load, calm } = tools;
     const { about } = code;
     const known = board.known && board.known.best !== board.known.random ? board.known : null;
     const scoreOf = (total) => (total - known.random) / (known.best - known.random);
@@ -544,9 +701,27 @@
       if (running) pause();
       tell("The gamepad is disconnected. Drive with the keys, or connect it again; Space continues.");
     });
-    const named = (name) => hands.pairs.map(([down, up], i) => `${nameOf(down)} ${nameOf(up)} ${name(about.controls[i].name)}`).join(", ");
-    const how = named(symbol);
-    stage.setAttribute("aria-label", `Drive ${board.id}. ${named((name) => name.replace(/_/g, " ")) || "Nothing acts here"}. Space pauses, R restarts, N is another start.`);
+    const choices = Math.max(0, ...about.controls.map(({ values }) => values.length));
+    const listed = choices ? `, or 1 to ${Math.min(choices, 9)} for one of the listed actions` : "";
+    /** The keys and what they control, to be read or to be heard. */
+    const described = (keys, name, unitOf) => hands.pairs
+      .map((pair, i) => {
+        const { meaning, unit } = about.controls[i];
+        return `${keys(pair)} ${[meaning, name(about.controls[i])].filter(Boolean).join(" ")}${unit && unitOf(unit)}`;
+      })
+      .join(", ") + listed;
+    const words = ({ name }) => name.replace(/_/g, " ");
+    const letter = (control) => (control.meaning && symbol(control.name) === words(control) ? "" : symbol(control.name));
+    const how = described((pair) => pair.map(nameOf).join(" "), letter, (unit) => ` [${unit}]`);
+    const heard = described(
+      (pair) => `${pair.map((key) => SPOKEN[key] ?? nameOf(key)).join(" and ")}:`,
+      (control) => (control.meaning ? "" : words(control)),
+      (unit) => ` in ${unit}`,
+    );
+    const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
+    const starting = (keys) =>
+      `${keys ? `${keys}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space or a tap starts.${nothing}`;
+    stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
 
     let { constants } = code;
     let seed = big(Math.floor(Math.random() * 2 ** 32));
@@ -556,8 +731,10 @@
     let linked = null;
     let rerunning = null;
     let running = false;
+    let tapped = null;
     let [before, left, shownAt] = [0, 0, 0];
     let [past, now] = [me.poses(), me.poses()];
+    const [between, ghostly] = [roomOf(about), roomOf(about)];
     let picture = board.picture;
     const untouched = () => constants === code.constants;
     const finished = (episode) => episode.over === "terminated" || episode.over === "truncated";
@@ -566,9 +743,9 @@
     /** A return, and its score if the episode is whole: where rewards are costs, a part of it looks too good. */
     const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode.total))}` : ""}`;
 
-    const tell = (words) => {
+    const tell = (words, spoken = words) => {
       message.textContent = words;
-      said.textContent = words;
+      said.textContent = spoken;
     };
 
     // --- ghosts
@@ -638,21 +815,20 @@
       if (!ghost) return;
       if (ghost.act) {
         ghost.episode = new Episode(code, seed, constants);
-        ghost.past = ghost.now = ghost.episode.poses();
+        [ghost.past, ghost.now] = [ghost.episode.poses(), ghost.episode.poses()];
       }
     }
 
     function stepGhost() {
       if (!ghost?.act || ghost.episode.over || ghost.episode.steps >= ghost.steps) return;
-      ghost.past = ghost.now;
       ghost.episode.step(ghost.act(ghost.episode));
-      ghost.now = ghost.episode.poses();
+      [ghost.past, ghost.now] = [ghost.now, ghost.episode.poses(ghost.past)];
     }
 
     /** The ghost's poses and return within the current step. */
     function ghostAt(part) {
       if (!ghost) return null;
-      if (ghost.act) return { poses: mixedPoses(ghost.past, ghost.now, ghost.episode.over ? 1 : part), total: ghost.episode.total };
+      if (ghost.act) return { poses: mixedPoses(ghost.past, ghost.now, ghost.episode.over ? 1 : part, ghostly), total: ghost.episode.total };
       const { replay } = ghost;
       if (!replay?.poses) return null;
       const exact = clamp(me.steps - 1 + part, 0, replay.end);
@@ -662,7 +838,14 @@
 
     // --- time
 
-    const mixedPoses = (a, b, part) => b.map((frame, i) => frame.map((x, j) => (j < 3 ? a[i][j] + (x - a[i][j]) * part : x)));
+    /** Poses between two moments, written into `room`; a control stays the same during a step. */
+    function mixedPoses(a, b, part, room) {
+      for (let i = 0; i < room.length; i++) {
+        for (let j = 0; j < 3; j++) room[i][j] = a[i][j] + (b[i][j] - a[i][j]) * part;
+        room[i][3] = b[i][3];
+      }
+      return room;
+    }
 
     /** Keep the seed in the address, unless a link there already has it. */
     function note() {
@@ -672,7 +855,7 @@
     function restart() {
       me = new Episode(code, seed, constants);
       mine = [];
-      past = now = me.poses();
+      [past, now] = [me.poses(), me.poses()];
       left = 0;
       share.hidden = true;
       startGhost();
@@ -686,7 +869,7 @@
      * times, and compiles what it has often run; so a drive begins at full speed.
      */
     function warmUp() {
-      const [trial, act] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest)];
+      const [trial, act, room] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest), roomOf(about)];
       let steps = 0;
       const more = () => {
         if (running || me.steps) return; // an agent may have a memory that reaches back to the start of its episode
@@ -694,7 +877,7 @@
         do {
           if (trial.over) trial.restart(big(steps));
           trial.step(act(trial));
-          trial.poses();
+          trial.poses(room);
           steps += 1;
         } while (performance.now() < end);
         if (steps < WARM) idly(more);
@@ -708,10 +891,9 @@
         finish("The link's keys end here");
         return;
       }
-      past = now;
       me.step(actionOf(key, about));
       if (me.over !== "refused") mine.push(key);
-      now = me.poses();
+      [past, now] = [now, me.poses(past)];
       stepGhost();
       if (me.over) finish();
     }
@@ -750,12 +932,14 @@
     }
 
     function label() {
+      stage.toggleAttribute("data-driving", running);
       go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
     }
 
     function run() {
       if (running) return;
       running = true;
+      tapped = null;
       note();
       message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive." : "";
       said.textContent = message.textContent || "Driving";
@@ -794,13 +978,13 @@
       pen.clearRect(0, 0, width, height);
       if (width && picture && about.frames) {
         const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
-        const poses = mixedPoses(past, now, part);
+        const poses = mixedPoses(past, now, part, between);
         const seenFrom = windowOf(picture, poses);
         paint(pen, box, seenFrom, placed(picture, poses, seenFrom));
         const beside = ghostAt(part);
         if (beside) {
           pen.globalAlpha = 0.35;
-          paint(pen, box, seenFrom, placed(picture, beside.poses, seenFrom), ["body", "mark"]);
+          paint(pen, box, seenFrom, placed(apart(picture, beside.poses, poses), beside.poses, seenFrom));
           pen.globalAlpha = 1;
         }
       }
@@ -919,6 +1103,9 @@
       } catch (error) {
         verdict.textContent = String(error.message);
         verdict.dataset.true = "false";
+        // Only the page's own links are offered, as the link may hold anything.
+        const page = error.id && all(".top nav a").find((one) => one.textContent === error.id);
+        if (page) verdict.append(" ", make("a", { href: page.getAttribute("href") + location.hash }, "Open it there"), ".");
         return;
       }
       const episode = new Episode(code, told.seed);
@@ -982,14 +1169,17 @@
       }
       stage.focus();
       seed = big(match[1]);
+      running = false;
       rerunning = null;
       restart();
+      tell(starting(how), starting(heard));
     }
 
     // --- what people do
 
     const still = (event) => event.ctrlKey || event.altKey || event.metaKey;
 
+    const acts = { " ": toggle, r: afresh, n: another };
     stage.addEventListener("keydown", (event) => {
       if (still(event) || event.target !== stage) return;
       const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -997,10 +1187,9 @@
       if (drives) {
         hands.pressed.add(key);
         if (!running && !ended()) run();
-      } else if (key === " ") toggle();
-      else if (key === "r") afresh();
-      else if (key === "n") another();
-      else return;
+      } else if (key in acts) {
+        if (!event.repeat) acts[key]();
+      } else return;
       event.preventDefault();
     });
     stage.addEventListener("keyup", (event) => hands.pressed.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key));
@@ -1029,24 +1218,50 @@
       hands.pointer = [clamp(across, -1, 1), clamp(up, -1, 1)];
     }
 
+    // A finger at rest on the picture scrolls the page, unless it taps; while one drives, it steers.
     canvas.addEventListener("pointerdown", (event) => {
-      if (event.button) return;
+      if (event.button || hands.finger !== null) return;
+      if (!running && event.pointerType === "touch") {
+        tapped = event;
+        return;
+      }
       canvas.setPointerCapture?.(event.pointerId);
       stage.focus({ preventScroll: true });
       if (!running) toggle();
+      hands.finger = event.pointerId;
       point(event);
       event.preventDefault();
     });
-    canvas.addEventListener("pointermove", (event) => hands.pointer && point(event));
+    canvas.addEventListener("pointermove", (event) => event.pointerId === hands.finger && point(event));
+    canvas.addEventListener("pointerup", (event) => {
+      const same = tapped?.pointerId === event.pointerId;
+      if (!same || Math.hypot(event.clientX - tapped.clientX, event.clientY - tapped.clientY) > TAP) return;
+      stage.focus({ preventScroll: true });
+      toggle();
+    });
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
-      canvas.addEventListener(name, () => (hands.pointer = null));
+      canvas.addEventListener(name, (event) => {
+        if (event.pointerId === hands.finger) [hands.pointer, hands.finger] = [null, null];
+        if (event.pointerId === tapped?.pointerId) tapped = null;
+      });
+    }
+
+    /** Follow the gamepad's buttons while there is one. */
+    function poll() {
+      const pressed = hands.pressedOnPad();
+      if (pressed.go) toggle();
+      else if (pressed.again) afresh();
+      else if (pressed.stick && !running && !ended()) run();
+      if (running && (pressed.go || pressed.again || pressed.stick)) stage.focus();
+      if (hands.pad !== null) requestAnimationFrame(poll);
     }
     const take = (pad) => {
-      hands.pad = pad.index;
-      tell("A gamepad is connected: drive with its stick.");
+      if (hands.pad === null) requestAnimationFrame(poll);
+      [hands.pad, hands.held] = [pad.index, {}];
+      tell("A gamepad is connected: drive with its stick. A or Start starts and pauses, B restarts.");
     };
     window.addEventListener("gamepadconnected", (event) => take(event.gamepad));
-    window.addEventListener("gamepaddisconnected", () => hands.readPad());
+    window.addEventListener("gamepaddisconnected", () => hands.gamepad());
     document.addEventListener("visibilitychange", () => document.hidden && running && pause());
 
     for (const [pressed, act] of [[go, toggle], [again, afresh], [fresh, another]]) {
@@ -1092,8 +1307,7 @@
     listGhosts();
     restart();
     warmUp();
-    const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
-    tell(`${how ? `${how}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space starts.${nothing}`);
+    tell(starting(how), starting(heard));
     if (calm.matches) speed.value = "0.5";
     const there = [...(navigator.getGamepads?.() ?? [])].find((pad) => pad?.connected);
     if (there) take(there);

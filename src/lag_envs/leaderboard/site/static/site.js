@@ -148,6 +148,16 @@
     });
   }
 
+  /** A picture with only what is not in the same place in another moment: bodies, marks, moved parts of the frame. */
+  function apart(picture, poses, others) {
+    const moved = (i) => [0, 1, 2].some((j) => poses[i][j] !== others[i][j]);
+    const shapes = picture.shapes.filter((shape) => {
+      const role = shape[shape.length - 1];
+      return role === "body" || role === "mark" || (role === "frame" && moved(shape[1]));
+    });
+    return { ...picture, shapes };
+  }
+
   /** The part of the plane to look at, [left, bottom, right, top]. */
   function windowOf({ window: [left, bottom, right, top], follows }, poses) {
     const [x, y] = follows === null ? [0, 0] : poses[follows];
@@ -281,11 +291,11 @@
     const at = Array.from({ length: n }, (_, i) => posesAt(poses, picture.units, i));
     const view = windowOf(picture, at[n - 1]);
     const box = { x: 0.02 * width, y: 0.02 * height, width: 0.96 * width, height: 0.96 * height };
-    const shapes = at.map((now) => placed(picture, now, view).filter(([what]) => what !== "magnifier"));
-    paint(pen, box, view, shapes[n - 1], ["ground", "frame", "guide", "target", "limit", "hole"]);
-    shapes.forEach((now, i) => {
+    const last = placed(picture, at[n - 1], view).filter(([what]) => what !== "magnifier");
+    paint(pen, box, view, last, ["ground", "frame", "guide", "target", "limit", "hole"]);
+    at.forEach((now, i) => {
       pen.globalAlpha = i === n - 1 ? 1 : mix(0.1, 0.45, i / n);
-      paint(pen, box, view, now, ["body", "mark"]);
+      paint(pen, box, view, placed(apart(picture, now, at[n - 1]), now, view));
     });
     pen.globalAlpha = 1;
   }
@@ -311,7 +321,7 @@
       requestAnimationFrame(frame);
     };
     const show = () => {
-      button.textContent = running ? "Pause" : "Play";
+      button.textContent = running ? "Pause the episode" : "Play the episode";
       begun = 0;
       if (running && replay) requestAnimationFrame(frame);
       else poster(canvas, board);
@@ -515,8 +525,8 @@
 
     function tick(now) {
       if (!playing) return;
-      // The first frame's time stamp may be from before the click.
-      time += (Math.max(0, now - before) / 1000) * Number(speed.value);
+      // The first frame's time stamp may be from before the click, and none comes while the page is hidden.
+      time += (clamp(now - before, 0, 100) / 1000) * Number(speed.value);
       before = now;
       if (time >= end()) {
         if (loop.checked && end() > 0) time = 0;
@@ -1211,7 +1221,7 @@
     const root = find("#drive");
     if (!root) return null;
     const [begin, said] = [find(".begin", root), find(".status", root)];
-    const tools = { make, find, text, symbol, fit, paint, placed, windowOf, posesAt, load, episodes, calm };
+    const tools = { make, all, text, symbol, fit, paint, placed, apart, windowOf, posesAt, load, episodes, calm };
     let driver = null;
 
     async function open(wanted) {
@@ -1264,7 +1274,7 @@
 
   // --- start -----------------------------------------------------------------------------------------------
 
-  window.lagEnvs = { put, load, placed, windowOf };
+  window.lagEnvs = { put, load, placed, windowOf, apart };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
   readColours();
