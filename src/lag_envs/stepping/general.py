@@ -343,20 +343,20 @@ class SeriesTangent:
         linear = self._known_linear.get(dt) or self._linear(dt)
         self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
         given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
-        found, some = np.empty((self._width, len(states))), np.arange(len(states))
-        longest = np.full(len(states), dt)
-        while len(some):  # again those whose substeps were too long for the derivatives
-            pulled, shorter = np.empty((self._width, len(some))), longest[some]
-            refused = self._pull(
-                np.ascontiguousarray(given[:, some]), np.ascontiguousarray(seeds[:, some]), pulled, shorter,
-                *linear, dt, order,
-            )  # fmt: skip
-            if refused:
-                return None, int(some[refused - 1]) + 1
-            found[:, some] = pulled
+        found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
+        refused = self._pull(given, seeds, found, longest, *linear, dt, order)
+        (some,) = np.nonzero(longest < dt)
+        while len(some) and not refused:  # again those whose substeps were too long for the derivatives
+            shorter, again = longest[some], np.empty((self._width, len(some)))
+            parts = np.ascontiguousarray(given[:, some]), np.ascontiguousarray(seeds[:, some])
+            refused = self._pull(*parts, again, shorter, *linear, dt, order)
+            found[:, some] = again
+            refused = refused and int(some[refused - 1]) + 1
             too_long = shorter < longest[some]
             longest[some] = shorter
             some = some[too_long]
+        if refused:
+            return None, refused
         if not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
         return found.T, refused
