@@ -40,7 +40,7 @@ def returns_from(kind, state, agent):
 
 
 def test_too_many_bars_are_named():
-    with pytest.raises(ValueError, match="at most 16, got 18: .* fewer coordinates than Chain with bars=8"):
+    with pytest.raises(ValueError, match=r"at most 16, got 18: .* fewer coordinates than Chain with bars=8"):
         gym.make(chain.SwingUpTriple.id, bars=8)
 
 
