@@ -85,7 +85,7 @@ class Place(NamedTuple):
     id : str
         The row.
     rank : int
-        From 1; rows that are not clearly different share one, and the next rank counts them all.
+        From 1; rows share one if none of them is clearly better. The next rank counts them all.
     above : Chance or None
         Probability that the row above does better than this one; None for the first.
     """
@@ -195,9 +195,8 @@ def compare(x: Scores, y: Scores, x_drawn: Array, y_drawn: Array) -> Chance:
 def ranked(scores: Mapping[str, Scores], drawn: Mapping[str, Array]) -> list[Place]:
     """Return the rows sorted by score, with their ranks.
 
-    A row shares the rank of the row above if one half lies in the interval of the probability that the row
-    above does better. Ties are passed on from row to row, so the first and the last row of one rank may well
-    be clearly different.
+    A row shares the rank of the row above unless some row of that rank is clearly better: unless the interval
+    of the probability that it does better leaves out one half.
 
     Parameters
     ----------
@@ -209,13 +208,11 @@ def ranked(scores: Mapping[str, Scores], drawn: Mapping[str, Array]) -> list[Pla
     order = sorted(scores, key=lambda id: (-float(iqm(scores[id].table.mean(axis=1))), id))
     places: list[Place] = []
     for number, id in enumerate(order, 1):
-        above = None
-        rank = number
-        if places:
-            best = places[-1].id
-            above = compare(scores[best], scores[id], drawn[best], drawn[id])
-            rank = places[-1].rank if above.undecided else number
-        places.append(Place(id, rank, above))
+        rank = places[-1].rank if places else 1
+        peers = [compare(scores[p.id], scores[id], drawn[p.id], drawn[id]) for p in places[rank - 1 :]]
+        if not all(chance.undecided for chance in peers):
+            rank = number
+        places.append(Place(id, rank, peers[-1] if peers else None))
     return places
 
 

@@ -58,8 +58,8 @@ COLUMNS = (
     Column(
         "rank",
         "Rank",
-        "Agents share a rank if it is not clear which of them is better. An agent that acts like an earlier "
-        "one has no rank.",
+        "Of agents that share a rank, none is clearly better than another. An agent that acts like an "
+        "earlier one has no rank.",
         True,
     ),
     Column("name", "Agent", "The submission's name and kind.", True),
