@@ -108,6 +108,27 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return re.sub(r"\]\(([^)\s]+)\)", link, markdown)
 
 
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Write minus signs in tables, and load a picture when it comes near; the first may be in view at once."""
+    first, image, rest = html.partition("<img ")
+    html = first + image + rest.replace("<img ", '<img loading="lazy" ')
+    return re.sub(r"<td.*?</td>", lambda cell: with_minus(cell[0]), html, flags=re.DOTALL)
+
+
+def with_minus(html: str) -> str:
+    """Return HTML with minus signs in place of hyphens before numbers, except in code and tags.
+
+    Examples
+    --------
+    >>> with_minus("<td>-1266.5, 1e-6, 2026-11-26 <code>-1</code></td>")
+    '<td>−1266.5, 1e-6, 2026-11-26 <code>-1</code></td>'
+    """
+    parts = re.split(r"(<(code|annotation)\b.*?</\2>|<[^>]*>)", html, flags=re.DOTALL)
+    # The text, and after each text two groups: code or a tag, and the name in it.
+    parts[::3] = [re.sub(r"(?<![\w.-])-(?=[\d∞])", "−", text) for text in parts[::3]]
+    return "".join(text for i, text in enumerate(parts) if i % 3 != 2 and text)
+
+
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
     """Add the board, which is built beside the pages, and the guide to it."""
     for section in nav.items:
