@@ -109,10 +109,9 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Write minus signs in tables, and load a picture when it comes near; the first may be in view at once."""
+    """Write minus signs, and load pictures when they come near; the first may be in view at once."""
     first, image, rest = html.partition("<img ")
-    html = first + image + rest.replace("<img ", '<img loading="lazy" ')
-    return re.sub(r"<td.*?</td>", lambda cell: with_minus(cell[0]), html, flags=re.DOTALL)
+    return with_minus(first + image + rest.replace("<img ", '<img loading="lazy" '))
 
 
 def with_minus(html: str) -> str:
