@@ -33,6 +33,7 @@ from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, 
 from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, pivoted_bar
+from lag_envs.tasks.base import OF_ENVIRONMENTS
 from lag_envs.tasks.measured import measured_entry
 from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
@@ -184,6 +185,12 @@ def test_argument_table(env_id, page):
     for name in positive:
         with pytest.raises(ValueError, match=f"{name} must be"):
             gym.make(env_id, **{name: -1.0})
+
+
+def test_usage_has_the_keywords_of_every_environment():
+    text = sections((ROOT / "docs" / "usage.md").read_text("utf-8"))["Keywords of every environment"]
+    for name in ("dt", "duration", "target", *OF_ENVIRONMENTS, "show_tiles"):
+        assert re.search(rf"`{name}(=|`)", text), name
 
 
 def as_python(latex):
