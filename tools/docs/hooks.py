@@ -109,9 +109,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Write minus signs, and load pictures when they come near; the first may be in view at once."""
+    """Write minus signs, and load pictures when they come near."""
+    return with_minus(with_lazy_pictures(html))
+
+
+def with_lazy_pictures(html: str) -> str:
+    """Return HTML whose pictures are loaded when they come near, except the first: it may be in view."""
     first, image, rest = html.partition("<img ")
-    return with_minus(first + image + rest.replace("<img ", '<img loading="lazy" '))
+    return first + image + rest.replace("<img ", '<img loading="lazy" ')
 
 
 def with_minus(html: str) -> str:
