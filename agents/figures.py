@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.analysis import Data
+from agents.learners import learner_label
 from agents.report import brief, meaningful_digits
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 
@@ -126,7 +127,7 @@ def curves_figure(envs: Mapping[str, Data], over: str) -> Any:
     shown = {i: e for i, e in envs.items() if any(a["kind"] == "learned" for a in e["agents"].values())}
     names = sorted({n for e in shown.values() for n, a in e["agents"].items() if a["kind"] == "learned"})
     styles = {
-        name: {"color": LINES[i % len(LINES)], "ls": ["-", "--", "-."][i % 3], "label": name}
+        name: {"color": LINES[i % len(LINES)], "ls": ["-", "--", "-."][i % 3], "label": learner_label(name)}
         for i, name in enumerate(names)
     }
     figure, axes = _panels(shown, columns=3)

@@ -87,8 +87,8 @@ PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-co
 
 
 def learner_label(algo: str) -> str:
-    """Return a learner's name in tables."""
-    return {**ALGORITHMS, **OWN}[algo][1]
+    """Return a learner's name in tables; any other agent has its own name."""
+    return {**ALGORITHMS, **OWN}.get(algo, ("", algo))[1]
 
 
 def learner(algo: str) -> type:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from agents.analysis import LEVELS, Data
+from agents.learners import learner_label
 from lag_envs.benchmark.console import short
 from lag_envs.benchmark.results import quartiles
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
@@ -41,7 +42,11 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     envs = data["envs"]
     parts = [
         "# Agents: what they reach",
-        "Made by `python -m agents.results` from `agents/results/summary.json`; do not edit it by hand.",
+        "<!-- Made by `python -m agents.results` from agents/results/summary.json. Do not edit by hand. -->",
+        "For each environment: how well every agent does, what it loses when it acts more often or when a"
+        " parameter, the noise or the delay changes, what its training took, and what is known about the"
+        " optimum. At the end: all environments in one figure, the learners compared, and how all of it was"
+        " measured.",
         _reading(),
     ]
     for env_id, env in envs.items():
@@ -107,7 +112,9 @@ def _reading() -> str:
         " Other agents have no training seeds, so only the episodes vary: mean, 1.96 standard errors"
         " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
         " a tenth; it reveals policies that exploit the discretisation. *Worst*: the lowest result under"
-        " changed parameters, noise and delay. *Training*: processor time of one run."
+        " changed parameters, noise and delay. *Training*: processor time of a run, the mean over its seeds;"
+        " the leaderboard has its wall time, which is longer where the machine also did other work."
+        " Fast PPO is `agents/ppo.py`, which commands know as `fast_ppo`."
     )
 
 
@@ -178,12 +185,12 @@ def labelled(name: str, agent: Data) -> str:
     Examples
     --------
     >>> labelled("sac", {"kind": "learned", "seeds": [0], "steps": 40_000.0})
-    'sac, 1 seed of 40,000 steps'
+    'SAC, 1 seed of 40,000 steps'
     """
     if agent["kind"] != "learned":
         return name
     seeds = len(agent["seeds"])
-    return f"{name}, {seeds} seed{'s' * (seeds > 1)} of {agent['steps']:,.0f} steps"
+    return f"{learner_label(name)}, {seeds} seed{'s' * (seeds > 1)} of {agent['steps']:,.0f} steps"
 
 
 def brief(name: str, agent: Data) -> str:
@@ -192,11 +199,11 @@ def brief(name: str, agent: Data) -> str:
     Examples
     --------
     >>> brief("sac", {"kind": "learned", "seeds": [0], "steps": 40_000.0})
-    'sac 1 × 40k'
+    'SAC 1 × 40k'
     """
     if agent["kind"] != "learned":
         return name
-    return f"{name} {len(agent['seeds'])} × {agent['steps'] / 1000.0:.0f}k"
+    return f"{learner_label(name)} {len(agent['seeds'])} × {agent['steps'] / 1000.0:.0f}k"
 
 
 def _behaviour(env_id: str) -> list[str]:
@@ -217,11 +224,11 @@ def _behaviour(env_id: str) -> list[str]:
         return " to ".join(dict.fromkeys(ends)) or "never"
 
     head = ["how they act", *next(iter(agents.values()))]
-    rows = [
-        [f"{name}, {len(next(iter(by.values())))} seeds" if len(next(iter(by.values()))) > 1 else name]
-        + [cell(values) for values in by.values()]
-        for name, by in agents.items()
-    ]
+    rows = []
+    for name, by in agents.items():
+        seeds = len(next(iter(by.values())))
+        label = learner_label(name) + (f", {seeds} seeds" if seeds > 1 else "")
+        rows.append([label, *map(cell, by.values())])
     text = (
         f"In the same {found['episodes']:,} episodes (`python -m agents.behaviour`): means, unless"
         " stated otherwise; for learners the range over their seeds."
@@ -265,7 +272,7 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
         agents = [envs[env_id]["agents"][name] for env_id in found["envs"]]
         rows.append(
             [
-                name,
+                learner_label(name),
                 with_interval({"value": found["value"], **_ends(found["interval"])}),
                 f"{len(found['envs'])}: {', '.join(found['envs'])}",
                 _span(len(agent["seeds"]) for agent in agents),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learners import LEARNERS, OWN, learner_label
+from agents.learners import OWN, learner_label
 from agents.optimum import DEFAULT_FOLDER, Solution, nodes, played, solvable
 from agents.run import MODEL, check_env, reports_errors
 from agents.value_iteration import CacheError
@@ -116,7 +116,7 @@ def optimal(env_id: str, folder: Path, cache: Path | None = DEFAULT_FOLDER) -> S
 def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
     """Write the finished runs of a learner, in a folder for each seed, as a submission."""
     algo = runs.name
-    name = learner_label(algo) if algo in LEARNERS else algo
+    name = learner_label(algo)
     origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
     module = OWN[algo][0].removeprefix("agents.") if algo in OWN else "learners"
     made, off, count = export(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +19,7 @@ from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.mpc import MPC, loss, without_kicks
 from lag_envs.controllers.tracking import Tracking, follow, hold, recorded, search
 from lag_envs.envs.model import Model
+from lag_envs.envs.program import check_draws
 from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.tasks import chain, pivoted_bar
 
@@ -37,6 +39,13 @@ def returns_from(kind, state, agent):
         total += reward
         assert not terminated
     return total
+
+
+def test_too_many_random_numbers_are_named():
+    with pytest.raises(ValueError, match=r"at most 16, got 18: .* fewer coordinates than Chain with bars=8"):
+        gym.make(chain.SwingUpTriple.id, bars=8)
+    with pytest.raises(ValueError, match="a kick takes 16 random numbers at most, got draws=17"):
+        check_draws(SimpleNamespace(draws=17))
 
 
 # --- rewards ---

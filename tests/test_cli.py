@@ -223,7 +223,10 @@ def test_watch_takes_agents_by_name_and_by_file(tmp_path):
         assert agent.predict(observation)[0].shape == (1, 1), name
     assert watch.load_agent(task.id, task, entries[-1].id, board)[0] == entries[-1].id
     for name, message in (
-        ("pppo", "has no agent 'pppo', and there is no such file; did you mean PPO?"),
+        (
+            "pppo",
+            "no such file (for an agent of a leaderboard, give the board's folder: --board FOLDER); did",
+        ),
         (str(tmp_path), "is neither a model nor a folder with model.zip"),
         (str(board / "submissions" / "PivotedBar-v0-ppo-c1dc3900"), "an agent of PivotedBar-v0, not of Piv"),
     ):
@@ -291,6 +294,7 @@ def test_watch_says_what_is_wrong(capsys, tmp_path, monkeypatch):
     assert "the folder of" in told(capsys, "watch", ID, "--video", str(tmp_path / "no" / "a.gif"))
     assert "--seed must be at least 0, got -1" in told(capsys, "watch", ID, "--seed", "-1")
     assert "did you mean" in told(capsys, "watch", "PivotedBra-v0")
+    assert "'Nope-v0'; `lag-envs list` names all" in told(capsys, "play", "Nope-v0")
     assert "show_trail must lie between 0 and 60 s" in told(capsys, "watch", ID, "--trail", "100")
     assert "show_trail must lie between 0 and 60 s" in told(capsys, "play", ID, "--trail", "100")
     assert "there is no board in nowhere" in told(capsys, "watch", ID, "--board", "nowhere")

@@ -33,6 +33,7 @@ from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, 
 from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, pivoted_bar
+from lag_envs.tasks.base import OF_ENVIRONMENTS
 from lag_envs.tasks.measured import measured_entry
 from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
@@ -166,11 +167,12 @@ def test_start_table(env_id, page):
 
 @each_id
 def test_argument_table(env_id, page):
-    """Every keyword is there, and makes an environment with its default."""
+    """Every keyword is there, makes an environment with its default, and has the range that is enforced."""
     found = rows(page, "Arguments", "Keyword")
     task = make(env_id).task
     names = {field.name for field in dataclasses.fields(task.scene)}
-    own = {"dt", "duration"} | ({"target"} if task.formulas.target_boxes else set())
+    own = {"dt", "duration", "show_arrows", "show_trail", "show_readout"}
+    own |= {"target"} if task.formulas.target_boxes else set()
     assert set(found) == names | own and all(row["Meaning"] for row in found.values())
     given = {name: ast.literal_eval(row["Default"]) for name, row in found.items()}
     again = gym.make(env_id, **given).unwrapped.task
@@ -178,6 +180,17 @@ def test_argument_table(env_id, page):
         value, default = getattr(again.scene, name), getattr(task.scene, name)
         assert value == (pytest.approx(default, rel=1e-4) if isinstance(default, float) else default), name
     assert again.limit == task.limit
+    assert "-∞" not in page.partition("## Arguments")[2].partition("## ")[0]
+    positive = [name for name, row in found.items() if row["Range"].startswith(("above 0", "at least 0"))]
+    for name in positive:
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            gym.make(env_id, **{name: -1.0})
+
+
+def test_usage_has_the_keywords_of_every_environment():
+    text = sections((ROOT / "docs" / "usage.md").read_text("utf-8"))["Keywords of every environment"]
+    for name in ("dt", "duration", "target", *OF_ENVIRONMENTS, "show_tiles"):
+        assert re.search(rf"`{name}(=|`)", text), name
 
 
 def as_python(latex):

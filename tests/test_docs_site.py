@@ -83,6 +83,13 @@ def test_every_page_is_there(site, pages):
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
 
 
+def test_minus_signs_and_pictures_of_a_long_page(site):
+    text = (site / "agents.html").read_text("utf-8")
+    assert "random actions −1266.5" in text and "gravity −20 %" in text
+    article = text.partition("<article")[2]
+    assert article.count("<img ") - article.count('<img loading="lazy" ') == 1
+
+
 def test_titles_and_previews(site, pages):
     """Each page has a title of its own, and says what a shared link shows."""
     texts = {name: (site / name).read_text("utf-8") for name in pages}

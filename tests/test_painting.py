@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 import os
 import re
 import shutil
@@ -41,7 +42,31 @@ def test_dashes_cover_the_line():
 
 def test_numbers_keep_their_width():
     assert [readout._number(x) for x in (-1.5, 12.345, -419.0)] == ["−1.500", "12.35", "−419.0"]
-    assert readout._number(123456.0) == "1.23e+05"
+    assert readout._number(123456.0) == "1.23e+05" and readout._number(math.nan) == "–"
+
+
+def test_names_are_written_as_on_the_page():
+    """The page's rule is in JavaScript; both must split a name alike."""
+    script = (Path(painting.__file__).parents[1] / "leaderboard/site/static/site.js").read_text("utf-8")
+    assert f"name.match(/{readout.NAME.pattern}/)" in script
+    assert readout.name_parts("theta_1_dot") == ("θ", "1", 1)
+    for word, letter in re.findall(r'(\w+): "(.)"', re.search(r"const GREEK = \{(.*?)\}", script)[1]):
+        assert readout.name_parts(word)[0] == letter
+
+
+@pytest.mark.parametrize(("size", "least"), [((600, 400), math.inf), ((300, 200), 4), ((150, 100), 2)])
+def test_readouts_have_room_for_everything_or_for_the_first_entries(size, least):
+    for task in TASKS.values():
+        viewer = rendering.Viewer(task, "rgb_array", rendering.Look(readout=True), size)
+        now = moment(task)
+        groups = viewer._readings(now, 0.0, 0.0, False)
+        assert [reading.name for reading in groups[0]][:2] == ["time", "return"]
+        written = readout.Readout(groups, size)
+        assert len(written._places) >= min(least, sum(map(len, groups)))
+        assert written._has_bar or size != (600, 400)
+        assert written.height <= max(48, size[1] / 3)
+        for row, x, right, after in written._places:
+            assert 0 <= x < right < after <= size[0] and 8 + readout.ROW * (row + 1) <= written.height
 
 
 # --- polygons ---

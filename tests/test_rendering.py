@@ -11,11 +11,12 @@ from pictures import IDS, TASKS, length, moment, picture, shown
 from rollouts import SINGLE
 
 import lag_envs
-from lag_envs.envs import painting, rendering
+from lag_envs.envs import painting, readout, rendering
 from lag_envs.envs.readout import STRIP_PAPER
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Polygon, Pose, Ruler, Window, beginning, placed
+from lag_envs.scores import score
 from lag_envs.tasks import Task, cylinder_in_cylinder, incline, pivoted_bar
 
 pygame = pytest.importorskip("pygame")
@@ -396,25 +397,38 @@ def test_what_cannot_be_shown_is_refused(option, message):
 
 
 def test_readout_counts_the_episode(monkeypatch):
+    """The score comes at the end: where rewards are negative, the first part would score above 1."""
     seen = []
-    monkeypatch.setattr(rendering, "write_readout", lambda image, rows, scale: seen.append(rows))
-    env = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True)
-    env.reset(seed=1)
-    total = 0.0
-    for _ in range(3):
+    monkeypatch.setattr(readout.Readout, "write", lambda self, image, groups, scale: seen.append(groups))
+    made = {"render_mode": "rgb_array", "show_readout": True}
+    env = gym.make("PivotedBar-v0", **made)
+    envs = gym.make_vec("PivotedBar-v0", 1, **made)
+    cut = gym.make_vec("PivotedBar-v0", 1, max_episode_steps=3, **made)
+    for one in (env, envs, cut):
+        one.reset(seed=1)
+    total, last = 0.0, int(TASKS["PivotedBar-v0"].limit)
+    for n in range(1, last + 1):
         total += env.step(np.ones(1, np.float32))[1]
-        env.render()
-    (first, second) = seen[-1]
+        for batch in (envs, cut):
+            batch.step(np.ones((1, 1), np.float32))
+        if n in (3, last - 1, last):
+            for one in (env, envs, cut):
+                one.render()
+            assert all(groups[0][2].name == "s_ddot" for groups in seen)
+            known = [groups[0][3].value for groups in seen[-3:-1]]
+            assert known == pytest.approx(
+                2 * [score("PivotedBar-v0", total) if n == last else math.nan], nan_ok=True
+            )
+            assert math.isnan(seen[-1][0][3].value)  # cut short
+    (first, second) = seen[-3]
     assert [(r.name, r.unit) for r in first] == [
         ("time", "s"),
         ("return", ""),
-        ("score", ""),
         ("s_ddot", "m/s²"),
+        ("score", ""),
     ]
     assert [r.name for r in second] == ["s", "s_dot", "theta", "theta_dot"]
-    from lag_envs.scores import score
-
-    assert [r.value for r in first[:3]] == pytest.approx([0.06, total, score("PivotedBar-v0", total)])
+    assert [r.value for r in first[:2]] == pytest.approx([0.02 * last, total])
     other = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True, mass=0.3)
     other.reset(seed=1)
     other.render()

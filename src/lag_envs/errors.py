@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import re
 import signal
 import sys
 import threading
@@ -97,12 +98,20 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
     --------
     >>> hint("PivotedBra-v0", ["PivotedBar-v0", "Acrobot-v1"])
     'did you mean PivotedBar-v0?'
+    >>> hint("Nope-v0", ["PivotedBar-v0", "Acrobot-v1"], "see the list")
+    'see the list'
     """
-    names = {k.lower(): k for k in known}
-    close = [names[c] for c in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)]
+    # The version that ids end with would make any two of them alike.
+    known = list(known)
+    names = {_without_version(k): k for k in known}
+    close = [names[c] for c in difflib.get_close_matches(_without_version(name), names, n=3, cutoff=0.5)]
     if close:
         return f"did you mean {' or '.join(close)}?"
-    return otherwise or f"there are {', '.join(names.values())}"
+    return otherwise or f"there are {', '.join(known)}"
+
+
+def _without_version(name: str) -> str:
+    return re.sub(r"-v\d+$", "", name.lower())
 
 
 def warn_of_misspelt(kind: type, base: type) -> None:

@@ -6,17 +6,27 @@ import dataclasses
 import inspect
 import itertools
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lag_envs.envs.interface import observation_space
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import layout_of
-from lag_envs.tables import aligned
+from lag_envs.tables import aligned, number_text
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
+
+
+class Keyword(NamedTuple):
+    """A keyword of an environment: its default, and in words its unit, its range and what it means."""
+
+    name: str
+    default: Any
+    unit: str
+    within: str
+    meaning: str
 
 
 def facts(task: Task, name: str, formulas: str) -> list[str]:
@@ -95,27 +105,50 @@ def _starts(task: Task) -> list[tuple[str, ...]]:
     return [(name, f"{centre:.4g} ± {half:g} {unit}") for name, centre, half, unit in names]
 
 
-def _parameters(task: Task) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
-    usable = task.usable_ranges()
+def keywords(task: Task) -> list[Keyword]:
+    """Return what an environment takes: its parameters, `dt`, `duration`, the target, what pictures show.
+
+    Imperfections and `diagnostics` are not among them, and what a parameter means is for the scene to say.
+    """
+    usable, rows = task.usable_ranges(), []
     for field in dataclasses.fields(task.scene):
-        value, about = getattr(task.scene, field.name), field.metadata
-        shown = f"{value:.6g} {about.get('unit', '')}".rstrip() if isinstance(value, float) else repr(value)
-        words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
-        rules = [f"{word} {about[key]:g}" for key, word in words.items() if about.get(key) is not None]
-        low, high = usable.get(field.name, (-math.inf, math.inf))
-        if math.isfinite(low):
-            rules = [f"{low:g} to {high:g}"]
-        rows.append((field.name, shown, ", ".join(rules)))
-    rows.append(("dt", f"{task.dt:g} s", "1e-6 to 1"))
-    rows.append(("duration", f"{task.duration:g} s", "at least dt; math.inf for no end"))
-    rows += [("target", "None", "random if None")] * bool(task.formulas.target_boxes)
+        if field.init:
+            within = _range(field.metadata, usable.get(field.name, (-math.inf, math.inf)))
+            unit = field.metadata.get("unit", "")
+            rows.append(Keyword(field.name, getattr(task.scene, field.name), unit, within, ""))
+    rows += [
+        Keyword("dt", task.dt, "s", "1e-6 to 1", "Control interval. The duration stays the same."),
+        Keyword("duration", task.duration, "s", "at least dt; math.inf for no end", "Length of an episode."),
+    ]
+    if task.formulas.target_boxes:
+        unit = ", ".join(dict.fromkeys(target.unit for target in task.formulas.target_boxes))
+        fixed = "A fixed target for every episode; None: a random one."
+        rows.append(Keyword("target", None, unit, "", fixed))
     return [
         *rows,
-        ("show_arrows", "False", "arrows for controls and forces in pictures"),
-        ("show_trail", "0 s", "length of the bodies' trails in pictures"),
-        ("show_readout", "False", "time, return, score, controls and state below pictures"),
+        Keyword("show_arrows", False, "", "", "Arrows for controls and forces in pictures."),
+        Keyword("show_trail", 0.0, "s", "0 to 60", "How far back the bodies' trails go in pictures."),
+        Keyword("show_readout", False, "", "", "Time, return, controls and state below pictures."),
     ]
+
+
+def _range(declared: Mapping[str, Any], usable: tuple[float, float]) -> str:
+    """Return a parameter's range: the one in which the task is usable, or else the one that is declared."""
+    words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
+    rules = [
+        f"{word} {number_text(declared[key])}" for key, word in words.items() if declared.get(key) is not None
+    ]
+    if any(map(math.isfinite, usable)):
+        rules = [" to ".join(map(number_text, usable))]
+    return ", ".join(rules) + ", or math.inf" * bool(declared.get("endless"))
+
+
+def _parameters(task: Task) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
+    for name, value, unit, within, meaning in keywords(task):
+        shown = f"{value:.6g} {unit}".rstrip() if isinstance(value, float) else repr(value)
+        rows.append((name, shown, within, meaning.rstrip(".")))
+    return rows
 
 
 def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:

@@ -1,7 +1,11 @@
-"""The only printers of tables, for terminals and in Markdown, so that the core needs no library for them."""
+"""The only printers of tables, for terminals and in Markdown, and of the numbers in them.
+
+The core needs no library for them.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 
@@ -36,3 +40,18 @@ def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> 
     """
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)
+
+
+def number_text(value: float) -> str:
+    """Return a number as people write it.
+
+    Examples
+    --------
+    >>> [number_text(x) for x in (0.02, 1e-06, 100000.0, 1e9, 3.14159265, math.inf, -0.0)]
+    ['0.02', '1e-6', '100000', '1e9', '3.1416', '∞', '0']
+    """
+    if math.isinf(value):
+        return "∞" if value > 0.0 else "-∞"
+    return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value + 0.0:.5g}").replace(
+        "1e5", "100000"
+    )

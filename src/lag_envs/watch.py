@@ -93,10 +93,10 @@ def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = No
         return name, _submission(env_id, on_board[name])
     path = Path(name)
     if not path.exists():
-        more = "" if on_board else "; those of a board go by name where its folder is, or with --board FOLDER"
+        more = "" if on_board else " (for an agent of a leaderboard, give the board's folder: --board FOLDER)"
         raise UserError(
-            f"{env_id} has no agent {name!r}, and there is no such file; "
-            f"{hint(name, [*names.values(), *on_board])}{more}"
+            f"{env_id} has no agent {name!r}, and there is no such file{more}; "
+            f"{hint(name, [*names.values(), *on_board])}"
         )
     if (path / "submission.toml").is_file():
         return path.name, _submission(env_id, path)

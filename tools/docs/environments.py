@@ -19,6 +19,7 @@ import numpy as np
 
 from lag_envs.envs.actions import Actions
 from lag_envs.envs.interface import observation_space
+from lag_envs.facts import keywords
 from lag_envs.leaderboard.docs import plain_markdown
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Scene
@@ -26,7 +27,7 @@ from lag_envs.scenes.declaring import complete
 from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
-from lag_envs.tables import markdown_table
+from lag_envs.tables import markdown_table, number_text
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured_entry
@@ -35,7 +36,6 @@ from tools.docs.markdown import (
     default_text,
     first_line,
     mean_with_error,
-    number_text,
     parameter_descriptions,
     sections,
 )
@@ -261,28 +261,11 @@ def _end(task: Task) -> str:
 
 def arguments(task: Task) -> str:
     """Return the table of an environment's keywords."""
-    kind = type(task.scene)
-    words = parameter_descriptions(kind)
-    rows = []
-    for field in keyword_fields(kind):
-        unit = field.metadata.get("unit", "")
-        low, high = task.usable_ranges().get(field.name, (None, None))
-        within = "" if low is None else f"{number_text(low)} to {number_text(high)}"
-        default = default_text(getattr(task.scene, field.name))
-        rows.append([f"`{field.name}`", default, unit, within, words.get(field.name, "")])
-    rows += [
-        ["`dt`", number_text(task.dt), "s", "1e-6 to 1", "Control interval. The duration stays the same."],
-        [
-            "`duration`",
-            number_text(task.duration),
-            "s",
-            "`dt` or more",
-            "Length of an episode; `math.inf` for no end.",
-        ],
+    words = parameter_descriptions(type(task.scene))
+    rows = [
+        [f"`{name}`", default_text(value), unit, within, meaning or words.get(name, "")]
+        for name, value, unit, within, meaning in keywords(task)
     ]
-    if task.formulas.target_boxes:
-        unit = ", ".join(dict.fromkeys(t.unit for t in task.formulas.target_boxes))
-        rows.append(["`target`", "None", unit, "", "A fixed target for every episode; None: a random one."])
     also = (
         'Also `render_mode` ("human" or "rgb_array"), and `diagnostics=True`, which puts controls, forces '
         "and energy into `info`; and those of [imperfect sensors and actuators and hidden parameters]"

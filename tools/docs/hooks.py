@@ -98,13 +98,14 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Give moving pictures their stills; docs/assets/docs.js adds a button."""
-    return re.sub(
+    """Give moving pictures their stills; docs/assets/docs.js adds a button. Write minus signs."""
+    html = re.sub(
         rf'<img [^>]*src="([^"]*{MOVING}/[^"]+)\.webp"[^>]*>',
         r'<span class="moving"><picture><source media="(prefers-reduced-motion: reduce)" '
         r'srcset="\1-still.webp">\g<0></picture></span>',
         html,
     )
+    return with_minus(with_lazy_pictures(html))
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -135,6 +136,26 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"]({back}{mark}{anchor})"
 
     return re.sub(r"\]\(([^)\s]+)\)", link, markdown)
+
+
+def with_lazy_pictures(html: str) -> str:
+    """Return HTML whose pictures are loaded when they come near, except the first: it may be in view."""
+    first, image, rest = html.partition("<img ")
+    return first + image + rest.replace("<img ", '<img loading="lazy" ')
+
+
+def with_minus(html: str) -> str:
+    """Return HTML with minus signs in place of hyphens before numbers, except in code and tags.
+
+    Examples
+    --------
+    >>> with_minus("<td>-1266.5, 1e-6, 2026-11-26 <code>-1</code></td>")
+    '<td>−1266.5, 1e-6, 2026-11-26 <code>-1</code></td>'
+    """
+    parts = re.split(r"(<(code|annotation)\b.*?</\2>|<[^>]*>)", html, flags=re.DOTALL)
+    # The text, and after each text two groups: code or a tag, and the name in it.
+    parts[::3] = [re.sub(r"(?<![\w.-])-(?=[\d∞])", "−", text) for text in parts[::3]]
+    return "".join(text for i, text in enumerate(parts) if i % 3 != 2 and text)
 
 
 def description(page: Page, markdown: str) -> str:

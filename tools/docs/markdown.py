@@ -7,6 +7,8 @@ import math
 import re
 from typing import Any
 
+from lag_envs.tables import number_text
+
 
 def first_line(kind: type) -> str:
     """Return the first line of a class's docstring, without its full stop."""
@@ -17,21 +19,6 @@ def sections(kind: type) -> dict[str, str]:
     """Return a docstring's text by its ``##`` headings; text before them has the empty heading."""
     parts = re.split(r"^## (.+)$", inspect.getdoc(kind) or "", flags=re.MULTILINE)
     return dict(zip(["", *parts[1::2]], (part.strip() for part in parts[::2]), strict=True))
-
-
-def number_text(value: float) -> str:
-    """Return a number as people write it.
-
-    Examples
-    --------
-    >>> [number_text(x) for x in (0.02, 1e-06, 100000.0, 1e9, 3.14159265, math.inf, -0.0)]
-    ['0.02', '1e-6', '100000', '1e9', '3.1416', '∞', '0']
-    """
-    if math.isinf(value):
-        return "∞" if value > 0.0 else "-∞"
-    return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value + 0.0:.5g}").replace(
-        "1e5", "100000"
-    )
 
 
 def mean_with_error(mean: float, error: float) -> str:

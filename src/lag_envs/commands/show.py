@@ -104,7 +104,10 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
         "--trail", metavar="S", type=seconds, default=0.0,
         help="show the path of the last S seconds (default: none)",
     )  # fmt: skip
-    parser.add_argument("--readout", action="store_true", help="show time, score, controls and state below")
+    parser.add_argument(
+        "--readout", action="store_true",
+        help="show time, return, controls and state below, and the score once an episode is over",
+    )  # fmt: skip
 
 
 def _look(args: argparse.Namespace) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
@@ -50,6 +51,23 @@ def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = fro
 
 
 _programs: dict[tuple, Program] = {}
+
+
+def check_draws(task: Any) -> None:
+    """Raise ValueError if a step or an episode's start needs more random numbers than are reserved."""
+    if task.draws > DRAWS:
+        raise ValueError(f"a kick takes {DRAWS} random numbers at most, got draws={task.draws}")
+    needed = len(task.scene.state_names) + task.formulas.targets
+    if needed > DRAWS:
+        choices = {
+            f.name: getattr(task.scene, f.name) for f in fields(task.scene) if "unit" not in f.metadata
+        }
+        made = "".join(f", {name}={value!r}" for name, value in choices.items())
+        raise ValueError(
+            "an episode's start takes a random number for each entry of the state and each target, at most "
+            f"{DRAWS}, got {needed}: use a scene with fewer coordinates than {type(task.scene).__name__}"
+            + (f" with {made[2:]}" if made else "")
+        )
 
 
 class Program:
@@ -93,13 +111,12 @@ class Program:
         names: Sequence[str] | None = None,
     ) -> None:
         formulas = task.formulas
+        check_draws(task)
         names = names or list(formulas.constants())
         constants = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         self._stepper = self._step_code(formulas, absent, constants)
         #: Whether steps use the general series, block by block, instead of a flow, lane by lane.
         self.general = not hasattr(self._stepper, "fast")
-        if max(formulas.draws, len(formulas.state) + formulas.targets) > DRAWS:
-            raise ValueError(f"a step may use {DRAWS} random numbers at most, got draws={formulas.draws}")
         self.y, self.z = self._stepper.start, self._stepper.end
         self.o = [f"o{i}" for i in range(len(formulas.observation))]
         self.a = [f"a{i}" for i in range(formulas.actions)]

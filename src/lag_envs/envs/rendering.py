@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs.forces import Forces
 from lag_envs.envs.painting import FORCE, STYLES, TRAIL, Pen, StyledShape
-from lag_envs.envs.readout import STRIP, write_readout
+from lag_envs.envs.readout import Readout
 from lag_envs.envs.screen import desk, load_pygame
 from lag_envs.scenes import shapes as s
 from lag_envs.scenes.picture import Picture, left_out_rates
@@ -38,7 +38,7 @@ class Look(NamedTuple):
     trail : float [s]
         How long the bodies' trails are.
     readout : bool
-        Whether time, return, score, controls and state are written below.
+        Whether time, return, controls and state are written below, and the score once the episode is over.
     """
 
     arrows: bool = False
@@ -96,7 +96,8 @@ class Viewer:
     def use(self, task: Task) -> None:
         """Show another task from now on, of the same class with other parameters."""
         self._task, self._picture = task, Picture(task)
-        self._pen = Pen(self._picture, self._size, STRIP if self._look.readout else 0)
+        self._pen: Pen | None = None
+        self._readout: Readout | None = None
         self._forces = Forces(task, self._picture) if self._look.arrows else None
         self._scale = _scale(task) if self._look.readout else None
         #: Points of the bodies that leave a trail; `_trail` has their earlier places.
@@ -110,6 +111,7 @@ class Viewer:
         steps: int = 0,
         total: float = 0.0,
         episode: int = 0,
+        over: bool = False,
     ) -> NDArray[np.uint8] | None:
         """Paint a state.
 
@@ -127,6 +129,8 @@ class Viewer:
             Sum of its rewards so far.
         episode : int
             A number that is different for each episode.
+        over : bool
+            Whether the episode is over, so that it has a score.
 
         Returns
         -------
@@ -148,7 +152,7 @@ class Viewer:
             self._trail.append([in_plane(poses[frame], tip) for frame, tip in self._tips.items()])
         if self._human and not again and not self._is_due():
             return None
-        picture = self._paint(now, poses, steps * self._task.dt, total)
+        picture = self._paint(now, poses, steps * self._task.dt, total, over)
         if not self._human:
             return picture
         desk.show(self, picture)
@@ -165,13 +169,19 @@ class Viewer:
         """Width and height of the picture [pixels]."""
         return self._size
 
-    def _paint(self, now: Frame, poses: list[Pose], seconds: float, total: float) -> NDArray[np.uint8]:
+    def _paint(
+        self, now: Frame, poses: list[Pose], seconds: float, total: float, over: bool
+    ) -> NDArray[np.uint8]:
         width, height = self._size
         image = np.full((height, width, 3), 255, np.uint8)
         more = list(self._more(now, poses))
+        readings = self._readings(now, seconds, total, over) if self._look.readout else None
+        if self._pen is None:
+            self._readout = None if readings is None else Readout(readings, self._size)
+            self._pen = Pen(self._picture, self._size, self._readout.height if self._readout else 0)
         self._pen.paint(image, poses, self._picture.window(poses), more)
-        if self._look.readout:
-            write_readout(image, self._readings(now, seconds, total), self._pen.scale)
+        if self._readout and readings:
+            self._readout.write(image, readings, self._pen.scale)
         return image
 
     def _more(self, now: Frame, poses: list[Pose]) -> Iterator[StyledShape]:
@@ -186,18 +196,18 @@ class Viewer:
             for arrow, is_control in self._forces.arrows(now, poses):
                 yield StyledShape(arrow, STYLES["action"] if is_control else FORCE, 1.0)
 
-    def _readings(self, now: Frame, seconds: float, total: float) -> list[list[Reading]]:
-        """Return the rows of the read-out."""
+    def _readings(self, now: Frame, seconds: float, total: float, over: bool) -> list[list[Reading]]:
+        """Return the groups of the read-out, in the order in which they give way to a lack of room.
+
+        An episode has a score only at its end: where rewards are negative, its beginning would score above 1.
+        """
         task = self._task
-        first = [Reading("time", seconds, "s"), Reading("return", total, "")]
+        first = [Reading("time", seconds, "s"), Reading("return", total, ""), *task.control_readings(now)]
         if self._scale is not None:
             random, best = self._scale
-            first.append(Reading("score", (total - random) / (best - random), ""))
+            first.append(Reading("score", (total - random) / (best - random) if over else math.nan, ""))
         names = zip(task.scene.state_names, now.state, task.scene.state_units, strict=True)
-        return [
-            [*first, *task.control_readings(now), *task.readings(now)],
-            [Reading(*entry) for entry in names],
-        ]
+        return [[*first, *task.readings(now)], [Reading(*entry) for entry in names]]
 
     def _turn(self, state: list[float]) -> None:
         """Integrate angles that the state leaves out; exact if rates are linear and every step is drawn."""

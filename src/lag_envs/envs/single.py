@@ -51,9 +51,11 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Whether pictures have arrows for controls without arrows of their own, and for the forces that the
         scene names.
     show_trail : float, default 0.0 [s]
-        How long the bodies' trails in pictures are.
+        How far back the bodies' trails in pictures go. They join the states that `render` was called for, so
+        call it after every step.
     show_readout : bool, default False
-        Whether time, return, score, controls and state are written below a picture.
+        Whether time, return, controls and state are written below a picture, and the score once the episode
+        is over. In small pictures the last of them are left out.
     **options
         Parameters of the scene and of the task: ``mass``, ``damping``, ``dt``, ``duration``, ``target``, ...;
         and hidden parameters, imperfect sensors and actuators: ``randomize``, ``observation_noise``,
@@ -236,7 +238,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._viewer.use(self._viewed)
         steps = int(self._rows[self._row["n"]])
         episode = int(self._ids[2])
-        return self._viewer.draw(self.state, self.control, self.target, steps, self._total, episode)
+        over = not self._ready or steps >= self.task.limit
+        return self._viewer.draw(self.state, self.control, self.target, steps, self._total, episode, over)
 
     def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
         """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""

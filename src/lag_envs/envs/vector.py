@@ -331,8 +331,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         targets = self.target if self.target is not None else [None] * self.num_envs
         of_each = (self.state, self.control, targets, self._steps.tolist(), self._totals.tolist())
         episodes = self._keys[2].tolist()
+        # An episode that `max_episode_steps` cuts short has no score.
+        over = ((self._read("n") < 0.0) & (self.limits == self.task.limit)).tolist()
         pictures = tuple(
-            viewer.draw(*now) for viewer, *now in zip(self._viewers, *of_each, episodes, strict=False)
+            viewer.draw(*now) for viewer, *now in zip(self._viewers, *of_each, episodes, over, strict=False)
         )
         if self._tiles is None:
             return pictures

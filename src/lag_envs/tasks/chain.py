@@ -335,7 +335,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     )
     note = """
 When the board opened, one recorded plan with time-varying feedback was best; it nearly always catches the
-chain. One of PPO's seeds has learnt a better swing since. Plans that are improved before the start use the
+chain. One of PPO's seeds has learned a better swing since. Plans that are improved before the start use the
 control at its limits, where feedback has no authority, and lose the chain on the way. MPC begins with the
 recorded plan or its mirror image, improves it a little every other step, and follows it by the same kind of
 feedback. It is better than the recorded plan, but that seed's swing is better still.

@@ -21,6 +21,9 @@ class RotarySwingUp(Task):
     A pendulum hangs from the end of an arm that a motor turns about the vertical: Furuta's apparatus. Turn
     the arm to and fro to swing the pendulum up, then keep it upright and the arm where it began.
 
+    Pictures show two views side by side: on the left the arm, seen from above; on the right the pendulum,
+    seen along the arm that carries it, with dashes where it should stand.
+
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The torque is held for one step.
