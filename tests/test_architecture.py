@@ -96,6 +96,7 @@ OTHERS_PRIVATE = {
     "_getvalue",  # Numba's arrays
     "_mpf_",  # mpmath's numbers
     "_pool_manager",  # Pebble's pool
+    "_version",  # PyTorch's tensors: how often they were changed in place
     "_asdict", "_fields", "_replace",  # named tuples: public, the underscore avoids names of fields
 }  # fmt: skip
 

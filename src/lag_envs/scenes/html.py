@@ -86,6 +86,8 @@ def _equations(scene: Any) -> str:
 
 def mathml(expression: Any, behind: str = "") -> str:
     """Return an expression, and text after it, as MathML, which browsers show; rates have dots."""
+    from xml.dom.minidom import parseString
+
     import sympy
     from sympy.core.function import AppliedUndef
     from sympy.printing.mathml import MathMLPresentationPrinter
@@ -126,7 +128,7 @@ def mathml(expression: Any, behind: str = "") -> str:
     names = {place: sympy.Symbol(place.func.__name__) for place in expression.atoms(AppliedUndef)}
     # Products of names need a sign between them.
     expression = expression.xreplace(names)
-    written = Printer({"mul_symbol": "dot"})._print(expression)
+    written: Any = parseString(Printer({"mul_symbol": "dot"}).doprint(expression)).documentElement
     parts = [""]
     for child in written.childNodes if expression.is_Add else [written]:
         if child.nodeName == "mo" and parts != [""]:
