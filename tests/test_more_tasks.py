@@ -283,17 +283,22 @@ def test_a_value_that_overflows_loses_no_plan(monkeypatch):
     assert np.isfinite(plan.actions).all() and np.isfinite(plan.gains).all()
 
 
-def test_at_rest_friction_has_its_slope():
-    """It changes its sign over 0.01 rad/s, so fast that linear motion dies out within a control step."""
+@pytest.mark.parametrize(
+    ("state", "torque"), [(None, 0.0), ([-2.50523255, 0.77003043, 0.4953778, 0.43204563], -4.25240342)]
+)
+def test_dry_friction_has_its_slope(state, torque):
+    """It changes its sign over 0.01 rad/s: a joint at rest or reversing soon forgets how fast it turned."""
     task = make_task(AcrobotReal.id)
-    scene, rest = task.scene, np.array(task.centre)
-    n, h, fine = len(rest), 1e-7, 40
-    held = np.zeros((fine, len(scene.control_names)))
+    scene, start = task.scene, np.array(task.centre if state is None else state)
+    n, h, fine = len(start), 1e-7, 40
+    held = np.full((fine, 1), torque)
     moved = [
-        scene.simulate(rest + sign * h * row, held, 0.02 / fine)[-1] for row in np.eye(n) for sign in (1, -1)
+        scene.simulate(start + sign * h * row, held, 0.01 / fine)[-1] for row in np.eye(n) for sign in (1, -1)
     ]
     slopes = (np.array(moved[::2]) - np.array(moved[1::2])).T / (2.0 * h)
-    np.testing.assert_allclose(scene.jacobian(rest, held[0], 0.02)[0], slopes, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(scene.jacobian(start, torque, 0.01)[0], slopes, rtol=1e-5, atol=1e-5)
+    by_state = [scene.vjp(start, torque, 0.01, row)[0] for row in np.eye(n)]
+    np.testing.assert_allclose(by_state, slopes, rtol=1e-5, atol=1e-5)
 
 
 def test_between_the_steps_of_a_plan_feedback_acts_on_the_line_between_its_states():

@@ -31,6 +31,10 @@ LARGEST_COUNT = 20_000
 SMALLEST_PART = 1e-9
 #: What the derivatives of a control step may leave out, relative to themselves.
 COMPLETE = 1e-13
+#: Last terms of derivatives below this part of them may be rounding errors.
+ROUNDED = 2e-15
+#: A part of the control step that derivatives alone do not divide further.
+SHORT = 1e-3
 
 
 def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
@@ -166,21 +170,25 @@ def _enough(length, dt, rest, order):  # type: ignore[no-untyped-def]
 
     The certificate does not cover derivatives: at rest a series has no terms, while those of its derivatives
     may be large. `rest` estimates what they leave out, relative to themselves, from their last terms. All
-    substeps of a step `dt` together may leave out `COMPLETE`.
+    substeps of a step `dt` together may leave out `COMPLETE`, or each as much as it is rounded.
     """
-    excess = rest * dt / (COMPLETE * length)
-    return length * max(0.05, 0.9 * excess ** (-1.0 / (order - 1))) if excess > 1.0 else np.inf
+    excess = rest / max(COMPLETE * length / dt, ROUNDED)
+    if not excess > 1.0 or length < SHORT * dt:
+        return np.inf
+    return length * max(0.05, 0.9 * excess ** (-1.0 / (order - 1)))
 
 
-def _advance_tangent(rows, slopes, kept, dt, order):  # type: ignore[no-untyped-def]
+def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
     `rows` are those of a lane, `slopes` those of `compile_series_tangent`; `kept` has room for what a substep
-    that turns out to be too long has to restore.
+    that turns out to be too long has to restore, `sizes` for the largest size of each column so far.
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = rows[span] = longest = dt
-    last = q + 2 + len(kept)  # behind the matrix
+    behind, width = q + 2 + len(kept), len(sizes)  # the matrix ends there
+    for i in range(width):
+        sizes[i] = 0.0
     while rows[left] > 0.0:
         before = rows[left]
         # What is longer by little only would leave a rest too short to be stepped.
@@ -197,8 +205,8 @@ def _advance_tangent(rows, slopes, kept, dt, order):  # type: ignore[no-untyped-
             slopes[status + 1] = used
             tangent(slopes, 0, order)
             rest = 0.0
-            for i in range(last, len(slopes)):
-                rest = max(rest, slopes[i])
+            for i in range(width):
+                rest = max(rest, slopes[behind + i] / max(sizes[i], slopes[behind + width + i]))
             enough = enough_of(used, dt, rest, order)
             if enough < np.inf:
                 rows[left], rows[wish], longest = before, enough, enough
@@ -209,6 +217,8 @@ def _advance_tangent(rows, slopes, kept, dt, order):  # type: ignore[no-untyped-
             else:
                 for i in range(2 * n):
                     slopes[q + i] = rows[q + i]
+                for i in range(width):
+                    sizes[i] = max(sizes[i], slopes[behind + width + i])
         if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
             return -np.int64(rows[status])
     return np.int64(rows[status])
@@ -221,14 +231,14 @@ def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def
     matrix of derivatives of places and velocities, row by row, and is replaced too.
     """
     rows, matrix, numbers = np.zeros(size), status + 2, slopes.shape[1]
-    moving = np.zeros(matrix + numbers + numbers // (2 * n))
-    kept = np.empty(2 * n + numbers)
+    kept, sizes = np.empty(2 * n + numbers), np.empty(numbers // (2 * n))
+    moving = np.zeros(matrix + numbers + 2 * len(sizes))
     for i in range(values.shape[0]):
         for j in range(status):
             rows[j] = moving[j] = values[i, j]
         for j in range(numbers):
             moving[matrix + j] = slopes[i, j]
-        if advance(rows, moving, kept, dt, order) < 0:
+        if advance(rows, moving, kept, sizes, dt, order) < 0:
             return i + 1
         for j in range(2 * n):
             values[i, q + j] = rows[q + j]
@@ -250,7 +260,7 @@ def compile_advance_tangents(record: SeriesRecord, columns: tuple[str, ...]) -> 
 
 @cache
 def _compile_enough() -> Callable:
-    return compile_python("enough_of", _enough, inner=True, COMPLETE=COMPLETE)
+    return compile_python("enough_of", _enough, inner=True, COMPLETE=COMPLETE, ROUNDED=ROUNDED, SHORT=SHORT)
 
 
 def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]

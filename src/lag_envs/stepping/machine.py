@@ -414,8 +414,8 @@ def compile_series_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Ca
 
     The rows are inputs, places and velocities as in `LaneLayout`, the time since the control step began, the
     step, and then the derivatives of the places and velocities by `columns`, as a matrix with `slots_for`
-    columns. Places, velocities and the matrix are replaced by those after the step. Behind the matrix lies an
-    estimate of what each column leaves out, relative to the column.
+    columns. Places, velocities and the matrix are replaced by those after the step. Behind the matrix lie an
+    estimate of what each column leaves out, and the columns' sizes, in two rows.
 
     Parameters
     ----------
@@ -495,7 +495,8 @@ def _write_tangent(
     shrinking = wide.select(wide.less(shrinking, most), shrinking, most)
     rest = wide.div(wide.mul(last, shrinking), wide.sub(wide.number(1.0), shrinking))
     size = largest([x for x in columns_of if x is not None], 1e-280)
-    builder.store(wide.div(rest, size), slopes(2 * n)).align = 8
+    builder.store(rest, slopes(2 * n)).align = 8
+    builder.store(size, slopes(2 * n + 1)).align = 8
     builder.ret_void()
     return function
 
