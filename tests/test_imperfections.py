@@ -96,6 +96,7 @@ def test_what_divides_no_step_single_and_vector(mode, lag):
     assert type(envs.unwrapped._program) is WholeProgram
 
 
+@pytest.mark.slow
 def test_every_place_in_a_batch_has_the_same_bits():
     lanes = [0, 3, 190, 191, 192, 249]
     many = gym.make_vec(ID, num_envs=250, duration=0.4, **WHOLE)

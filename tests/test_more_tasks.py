@@ -283,6 +283,7 @@ def test_a_value_that_overflows_loses_no_plan(monkeypatch):
     assert np.isfinite(plan.actions).all() and np.isfinite(plan.gains).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("state", "torque"), [(None, 0.0), ([-2.50523255, 0.77003043, 0.4953778, 0.43204563], -4.25240342)]
 )

@@ -34,7 +34,7 @@ COMPLETE = 1e-13
 #: Last terms of derivatives below this part of them may be rounding errors.
 ROUNDED = 2e-15
 #: A part of the control step that derivatives alone do not divide further.
-SHORT = 1e-3
+SHORT = 1e-6
 
 
 def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
