@@ -183,6 +183,7 @@ def vjp(
         )
     if not np.isfinite(seeds).all():
         raise ValueError(f"cotangent must be finite, got {seeds[~np.isfinite(seeds)][0]}")
+    check_turns(scene, states)
     found = pulled(scene, states, controls, check_step(dt), seeds.reshape(-1, n), by)
     found = found.reshape(*shape, n + m + len(by))
     parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
@@ -198,12 +199,13 @@ def pulled(
     by: tuple[str, ...],
     rows: Sequence[int] | None = None,
 ) -> Array:
-    """Return `vjp` of rows of checked arrays, side by side; `rows` are their numbers in error messages."""
-    check_turns(scene, states, rows)
+    """Return `vjp` of rows of checked arrays, also by `check_turns`; errors name the rows by `rows`."""
     derivatives = _derivatives(scene, by)
     found, refused = derivatives.vjp(states, controls, dt, cotangents)
-    if refused or not np.isfinite(found).all():
-        i = refused - 1 if refused else int(np.argwhere(~np.isfinite(found))[0, 0])
+    if not refused and not np.isfinite(found).all():
+        refused = int(np.argwhere(~np.isfinite(found))[0, 0]) + 1
+    if refused:
+        i = refused - 1
         slopes, step_refused = derivatives.jacobian(states[i : i + 1], controls[i : i + 1], dt)
         if not step_refused and np.isfinite(slopes).all():
             raise ValueError(

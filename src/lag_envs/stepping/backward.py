@@ -16,6 +16,7 @@ from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
+from lag_envs.stepping.paired import Pair, PairTarget
 from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress
 from lag_envs.stepping.target import Target
 
@@ -62,8 +63,13 @@ class Backward(Series):
 
     @property
     def entries(self) -> int:
-        """How many numbers a lane needs: coefficients, cotangents, those of masses and weights."""
-        return STRIDE * (self._first_cell + -(-max(len(self._cells), 1) // STRIDE))
+        """How many numbers a lane needs: coefficients, and pairs of cotangents."""
+        return STRIDE * (self.slots + 2 * self._bar_slots)
+
+    @property
+    def _bar_slots(self) -> int:
+        """How many slots cotangents need, with those of masses and weights."""
+        return self._first_cell - self.slots - (-max(len(self._cells), 1) // STRIDE)
 
     @property
     def _first_cell(self) -> int:
@@ -153,37 +159,19 @@ class Backward(Series):
         Before them stands an estimate of what the cotangents leave out: a fifth of what the last terms
         contribute, and less of the last but one, since there may be only odd or only even terms.
         """
-        one, zero = t.number(1.0), t.number(0.0)
-        fifth, fiftieth = t.number(0.2), t.number(0.02)
+        both: Any = PairTarget(t, self.slots, self._bar_slots)
+        found = self._sweep(both, start, h, order, ends)
+        return [x.last for x in found], [x.whole for x in found]
 
-        def sweep(turn: Any, found: Sequence) -> list:
-            whole = t.below(t.index(0), turn)
+    def _sweep(self, t: Any, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list[Pair]:
+        """Return cotangents before the step, and what their last terms contribute."""
+        zero = t.number(0.0)
 
-            def weight(k: Any) -> Any:
-                last = t.below(t.minus(order, k), t.index(1))
-                but_one = t.below(t.minus(order, k), t.index(2))
-                return t.select(whole, one, t.select(last, fifth, t.select(but_one, fiftieth, zero)))
+        def weight(k: Any) -> Any:
+            """Return by how much a term of order k counts in the estimate."""
+            last, but_one = (t.below(t.minus(order, k), t.index(i)) for i in (1, 2))
+            return t.select(last, t.number(0.2), t.select(but_one, t.number(0.02), zero))
 
-            direct = t.select(whole, one, zero)
-            return [*found[len(ends) :], *self._sweep(t, start, h, order, ends, weight, direct)]
-
-        found = t.loop(t.index(0), t.index(2), [zero] * (2 * len(ends)), sweep)
-        return found[: len(ends)], found[len(ends) :]
-
-    def _sweep(
-        self,
-        t: Target,
-        start: ExpansionStart,
-        h: Any,
-        order: Any,
-        ends: Sequence,
-        weight: Callable,
-        direct: Any,
-    ) -> list:
-        """Return cotangents before the step, where its terms of order k count by a weight.
-
-        Cotangents also remain what they are, by the weight `direct`.
-        """
         self._clear(t, order)
         n = self.size
 
@@ -191,11 +179,11 @@ class Backward(Series):
             per = t.mul(h, t.reciprocal(t.plus(k, 1)))
             for i in range(n):
                 bar = t.fma(per, ends[i], ends[n + i])
-                t.store(self._bar("v", i), k, t.mul(weight(k), bar))
+                t.store(self._bar("v", i), k, Pair(bar, t.mul(weight(k), bar)))
             return []
 
         t.loop(t.index(0), t.plus(order, 1), [], seed)
-        ends = [t.mul(direct, end) for end in ends]
+        ends = [Pair(end, zero) for end in ends]
 
         def back(m: Any, carried: Sequence) -> list:
             self._one_order_back(t, start, h, t.minus(order, m), order)
@@ -257,26 +245,29 @@ class Backward(Series):
 
         For factors whose cotangents are kept in slots, it is added there.
         """
-        found: dict[Factor, Any] = {}
-        pairs = list(self.pairs.items())
-        for begin in range(0, len(pairs), t.group):
-            some = pairs[begin : begin + t.group]
+        products: dict[Factor, list] = {}  # Σ_m P_m B_{m-k} is added to the cotangent of A_k
+        for key, (a, b) in self.pairs.items():
+            if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
+                products.setdefault(a, []).append((key, b))
+            if a != b:
+                products.setdefault(b, []).append((key, a))
+        factors, most, waiting = list(products), 2 * t.group, []
+        for begin in range(0, len(factors), most):
+            some = factors[begin : begin + most]
 
             def later(i: Any, carried: Sequence, some: Sequence = some) -> list:
-                m = t.minus(order, i)  # what was found last is added last
-                found: list = []
-                for (key, (a, b)), of_a, of_b in zip(some, carried[::2], carried[1::2], strict=True):
-                    bar, x, y = t.load(self._sums[key], m), *(f.load(t, t.minus(m, k)) for f in (a, b))
-                    found += [of_a if first and isinstance(key, tuple) else t.fma(bar, y, of_a)]
-                    found += [t.fma(bar, x, of_b)]
+                m, found = t.minus(order, i), []  # what was found last is added last
+                for factor, total in zip(some, carried, strict=True):
+                    for key, other in products[factor]:
+                        total = t.fma(t.load(self._sums[key], m), other.load(t, t.minus(m, k)), total)
+                    found.append(total)
                 return found
 
-            # A sum for each factor of each pair: many short chains of additions keep the processor busy.
-            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * (2 * len(some)), later)
-            for (key, (a, b)), of_a, of_b in zip(some, sums[::2], sums[1::2], strict=True):
-                if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
-                    found[a] = t.add(found[a], of_a) if a in found else of_a
-                found[b] = t.add(found[b], of_b) if b in found else of_b
+            # Several chains of additions keep the processor busy. Their results wait in memory, so that the
+            # next chains find room in registers.
+            zero = Pair(t.number(0.0), t.number(0.0))
+            waiting.append(t.aside(t.loop(t.index(1), t.minus(order, k), [zero] * len(some), later)))
+        found = dict(zip(factors, (x for back in waiting for x in back()), strict=True))
         for factor in [factor for factor in found if factor.slot in self._bars]:
             total = found.pop(factor)
             if not (first and factor.back):
@@ -362,15 +353,15 @@ class Backward(Series):
         elif op == "product":
             add(args[0], bar, zero[args[1]])
             add(args[1], bar, zero[args[0]])
-            t.store(self._sums[n], k, bar)
+            self._keep_sum(t, n, k, bar)
         elif op == "reciprocal":  # Σ x_j z_{k-j} = 0
             less = t.neg(t.mul(bar, zero[n]))
             add(args[0], less, zero[n])
-            t.store(self._sums[n], k, less)
+            self._keep_sum(t, n, k, less)
         elif op == "sqrt":  # Σ z_j z_{k-j} = x_k
             half = t.mul(bar, t.div(t.number(0.5), zero[n]))
             add(args[0], half, t.number(1.0))
-            t.store(self._sums[n], k, t.neg(half))
+            self._keep_sum(t, n, k, t.neg(half))
         else:  # k z_k = Σ_{j>0} D_j w_{k-j}
             assert op in FUNCTIONS
             slope = self.slope_of(n)
@@ -381,7 +372,12 @@ class Backward(Series):
                 self._add(t, self._bars[slope.slot], t.plus(k, -1), scaled, zero[args[1]])
             else:
                 add(args[0], bar, zero[args[1]])
-            t.store(self._sums[n], k, scaled)
+            self._keep_sum(t, n, k, scaled)
+
+    def _keep_sum(self, t: Target, n: int, k: Any, bar: Any) -> None:
+        """Store the cotangent of a node's sum of products, twice where both factors are the same."""
+        a, b = self.pairs[n]
+        t.store(self._sums[n], k, t.add(bar, bar) if a == b else bar)
 
     def _product(self, t: Target, k: Any, a: Factor, b: Factor) -> Any:
         """Return Σ_{0<j<=k} A_j B_{k-j}."""

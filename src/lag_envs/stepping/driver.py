@@ -172,9 +172,9 @@ def _enough(length, dt, rest, order):  # type: ignore[no-untyped-def]
     may be large. `rest` estimates what they leave out, relative to themselves, from their last terms. All
     substeps of a step `dt` together may leave out `COMPLETE`, or each as much as it is rounded.
     """
-    excess = rest / max(COMPLETE * length / dt, ROUNDED)
-    if not excess > 1.0 or length < SHORT * dt:
+    if not (rest > ROUNDED and rest * dt > COMPLETE * length) or length < SHORT * dt:
         return np.inf
+    excess = rest / max(COMPLETE * length / dt, ROUNDED)
     return length * max(0.05, 0.9 * excess ** (-1.0 / (order - 1)))
 
 
@@ -406,7 +406,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
-    width = lanes(record)
+    width = max(lanes(record), registers().doubles)  # no choice makes it fit into the nearest cache
     numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     helpers = compile_pull(record, sources, width), _compile_enough(), *loops

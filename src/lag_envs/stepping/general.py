@@ -25,7 +25,10 @@ from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variabl
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.rows import Rows
-from lag_envs.stepping.series import TOLERANCE
+from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE
+
+#: How many terms more the series of derivatives has.
+FURTHER = 2
 
 
 class SeriesStepper:
@@ -335,11 +338,14 @@ class SeriesTangent:
     def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
         """Return gradients with respect to states, controls and parameters from those of the end states.
 
-        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
+        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`. The
+        series goes further than `order`: derivatives need some terms more than the motion, and a step that
+        is taken again, shorter, costs more than they do.
         """
         if self._stepper.mechanics.coupling:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
+        order = min(order + FURTHER, LARGEST_ORDER)
         linear = self._known_linear.get(dt) or self._linear(dt)
         self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
         given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
@@ -355,11 +361,7 @@ class SeriesTangent:
             too_long = shorter < longest[some]
             longest[some] = shorter
             some = some[too_long]
-        if refused:
-            return None, refused
-        if not np.isfinite(found).all():
-            refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
-        return found.T, refused
+        return (None if refused else found.T), refused
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
         """Return the constants, and derivatives of the series' start and of the end state, for `_pull`.

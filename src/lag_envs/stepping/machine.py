@@ -22,6 +22,7 @@ from lag_envs.stepping import (
     elementary,
     lowering,
     matrices,
+    paired,
     primitives,
     series,
     target,
@@ -286,8 +287,8 @@ class Machine:
 def _version() -> str:
     """Return a digest of all that decides what is printed: this code, and the processor's registers."""
     modules = (
-        *(algebra, backward, certificate, dual, elementary, lowering, matrices, primitives, series),
-        *(target, tracing),
+        *(algebra, backward, certificate, dual, elementary, lowering, matrices, paired, primitives),
+        *(series, target, tracing),
     )
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]
