@@ -690,12 +690,12 @@
     const [episodeLabel, episodeSelect] = list("The ghost's episode", []);
     const bar = make("div", { class: "drive-controls", role: "group", "aria-label": "Driving" }, go, again, fresh, watch, speedLabel, ghostLabel, episodeLabel);
     const verdict = make("p", { class: "verdict", role: "status" });
-    const link = make("input", { type: "text", readonly: "", "aria-label": "Link of this drive" });
+    const link = make("input", { type: "text", readonly: "", "aria-label": "Link of this drive", placeholder: "Your drive's link, once it stops" });
     const copy = button("copy", "Copy link");
     const share = make("div", { class: "share" }, link, copy);
     const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
     root.replaceChildren(stage, bar, readout, verdict, share, panel, said);
-    share.hidden = watch.hidden = episodeLabel.hidden = true;
+    copy.disabled = watch.hidden = episodeLabel.hidden = true;
 
     const hands = new Hands(about, () => {
       if (running) pause();
@@ -857,7 +857,7 @@
       mine = [];
       [past, now] = [me.poses(), me.poses()];
       left = 0;
-      share.hidden = true;
+      setLink("");
       startGhost();
       if (running) note();
       label();
@@ -888,31 +888,46 @@
     function tick() {
       const key = rerunning ? rerunning.keys[me.steps] : hands.numbers();
       if (!key) {
-        finish("The link's keys end here");
+        close("The link's keys end here");
         return;
       }
       me.step(actionOf(key, about));
       if (me.over !== "refused") mine.push(key);
       [past, now] = [now, me.poses(past)];
       stepGhost();
-      if (me.over) finish();
+      if (me.over) close();
     }
 
-    function finish(words = "") {
+    /** Stop. What is said and offered at the end waits for the next frames: it lays out the page anew. */
+    function close(words = "") {
+      const of = me;
+      const later = (work) => () => {
+        if (me === of && !running) work();
+      };
       running = false;
+      requestAnimationFrame(later(() => {
+        finish(words);
+        idly(later(offer));
+      }));
+    }
+
+    function finish(words) {
       label();
       const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
       const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
       const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
       tell(`${ending}: ${result}${beside}. R: ${rerunning ? "drive from this start" : "again"}, N: another start.`);
-      offer();
+    }
+
+    function setLink(value) {
+      link.value = value;
+      copy.disabled = !value;
     }
 
     /** Offer the link of this drive. */
     function offer() {
       if (!untouched() || !mine.length || rerunning) return;
-      link.value = writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, ""));
-      share.hidden = false;
+      setLink(writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, "")));
     }
 
     function frame(time) {
@@ -943,7 +958,7 @@
       note();
       message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive." : "";
       said.textContent = message.textContent || "Driving";
-      share.hidden = true;
+      setLink("");
       before = performance.now();
       label();
       requestAnimationFrame(frame);
