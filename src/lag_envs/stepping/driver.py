@@ -134,11 +134,10 @@ def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE, fused: b
 def lanes(record: SeriesRecord) -> int:
     """Return how many lanes are stepped at once.
 
-    As many as one register holds, but at least four. Small series take two registers for each number. Large
-    ones take half of a wide register, so that they find room in the nearest cache.
+    As many as one register holds, but at least four. Small series take two registers for each number.
     """
-    slots, doubles = Series(record).slots, registers().doubles
-    return max(4, 2 * doubles if slots < 8 else doubles if slots < 24 else doubles // 2)
+    doubles = registers().doubles
+    return max(4, 2 * doubles if Series(record).slots < 8 else doubles)
 
 
 @cache
@@ -406,7 +405,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
-    width = max(lanes(record), registers().doubles)  # no choice makes it fit into the nearest cache
+    width = lanes(record)
     numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     helpers = compile_pull(record, sources, width), _compile_enough(), *loops
