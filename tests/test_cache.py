@@ -14,7 +14,7 @@ import pytest
 from covering import every
 
 from lag_envs.cli import main
-from lag_envs.stepping import cache
+from lag_envs.stepping import cache, machine
 from lag_envs.tasks import incline
 
 try:
@@ -362,3 +362,9 @@ def test_numbers_that_a_function_names_decide_too(monkeypatch):
 
 def add_named(x):
     return x + NAMED
+
+
+def test_the_length_of_rows_decides_the_printed_steps(monkeypatch):
+    before = machine._version()
+    monkeypatch.setattr(machine, "BLOCK", machine.BLOCK // 2)
+    assert machine._version.__wrapped__() != before

@@ -285,7 +285,7 @@ class Machine:
 
 @cache
 def _version() -> str:
-    """Return a digest of all that decides what is printed: this code, and the processor's registers."""
+    """Return a digest of all that decides what is printed: this code, registers, and the length of rows."""
     modules = (
         *(algebra, backward, certificate, dual, elementary, lowering, matrices, paired, primitives),
         *(series, target, tracing),
@@ -293,7 +293,7 @@ def _version() -> str:
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]
     )
-    return hashlib.sha256(f"{source}{registers()}".encode()).hexdigest()
+    return hashlib.sha256(f"{source}{registers()}{BLOCK}".encode()).hexdigest()
 
 
 def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
