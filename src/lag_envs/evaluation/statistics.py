@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,25 +102,54 @@ def median_time(times: Sequence[float | None]) -> float | None:
 # --- luck ---------------------------------------------------------------------------------------------------
 
 
-def luck_slope(returns: ArrayLike, luck: ArrayLike) -> float:
-    """Return the slope of returns over another agent's in the same episodes; 0 if those are all equal.
+class Luck(NamedTuple):
+    """How returns follow another agent's in the same episodes.
+
+    Attributes
+    ----------
+    slope : float
+        Slope of the returns over the other agent's; 0 if the returns are better left as they are.
+    error : float
+        What the slope's own standard error adds to that of the corrected mean.
+    """
+
+    slope: float = 0.0
+    error: float = 0.0
+
+
+def luck_of(returns: ArrayLike, luck: ArrayLike, mean: float) -> Luck:
+    """Return how far luck accounts for returns, by linear regression over another agent's.
+
+    The returns' mean can be corrected to what it would be if the other agent had had its true mean in these
+    episodes. The slope is 0 where that would not make the mean more certain: the slope of a few episodes, in
+    which the other agent always does nearly the same, says nothing about those in which it does not.
 
     Parameters
     ----------
     returns, luck : array_like, shape (policies, episodes)
         Returns of an agent's policies, and of the other agent in their episodes.
+    mean : float
+        The other agent's true mean.
     """
     values, others = np.asarray(returns, np.float64), np.asarray(luck, np.float64)
     apart = others - others.mean(axis=1, keepdims=True)
-    square = np.sum(apart * apart)
-    return float(np.sum(apart * values) / square) if square > 0.0 else 0.0
+    own = values - values.mean(axis=1, keepdims=True)
+    square, free = float(np.sum(apart * apart)), own.size - len(own)
+    if square <= 0.0 or free < 10:  # fewer say too little about their own spread
+        return Luck()
+    slope = float(np.sum(apart * values)) / square
+    variance = float(np.sum((own - slope * apart) ** 2)) / (free - 1)
+    error = abs(mean - float(others.mean())) * math.sqrt(variance / square)
+    if variance / own.size + error**2 < float(np.sum(own * own)) / free / own.size:
+        return Luck(slope, error)
+    return Luck()
 
 
 def without_luck(returns: ArrayLike, reference: ArrayLike | None) -> tuple[float, float]:
     """Return mean and standard error of returns in the first episodes that a reference played.
 
-    The reference's excess in these episodes over its mean in all of them is subtracted, times `luck_slope` (a
-    control variate).
+    The reference's excess in these episodes over its mean in all of them is subtracted, times the slope of
+    `luck_of` (a control variate).
 
     Parameters
     ----------
@@ -141,10 +170,10 @@ def without_luck(returns: ArrayLike, reference: ArrayLike | None) -> tuple[float
     if reference is None:
         return mean_and_error(values)
     same = np.asarray(reference, np.float64)[: len(values)]
-    slope = luck_slope(values[None], same[None])
-    rest, error = mean_and_error(values - slope * same)
     mean, its_error = mean_and_error(reference)
-    return rest + slope * mean, math.hypot(error, slope * its_error)
+    luck = luck_of(values[None], same[None], mean)
+    rest, error = mean_and_error(values - luck.slope * same)
+    return rest + luck.slope * mean, math.hypot(error, luck.error, luck.slope * its_error)
 
 
 # --- errors and intervals -----------------------------------------------------------------------------------

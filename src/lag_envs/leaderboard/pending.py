@@ -174,7 +174,7 @@ class Neighbours:
 
         reference = self._protocols[entry.protocol].references.get(entry.env)
         results = (result, self.board.result(other))
-        error = max(policy_error(reference, each["policies"]) for each in results)
+        error = max(policy_error(reference, each["policies"]) or 0.0 for each in results)
         likeness = self._likeness.setdefault(
             (entry.env, result["nonce"]), Likeness(entry.env, result["nonce"])
         )

@@ -13,7 +13,7 @@ bootstrap intervals of 95 %:
   resampled. The interval says how well the mean is known, and nothing about training.
 - The reference that measures luck has a mean that is itself uncertain. Each bootstrap sample therefore draws
   another mean from a normal distribution. The same one is used for all rows, since an error moves them all
-  together, each as far as it was corrected (`slope`). The reference's own row is moved all the way: after
+  together, each as far as it was corrected (`luck`). The reference's own row is moved all the way: after
   the correction, nothing is left of it but that mean, of other episodes, with its standard error.
 
 Each row's generator is seeded by its id, so a row's numbers do not depend on the other rows.
@@ -27,6 +27,7 @@ References
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -36,10 +37,11 @@ from numpy.typing import NDArray
 from lag_envs.evaluation.statistics import (
     RESAMPLES,
     THRESHOLDS,
+    Luck,
     ends,
     improvement,
     iqm,
-    luck_slope,
+    luck_of,
     median_time,
     optimality_gap,
     profile,
@@ -95,11 +97,11 @@ class Place(NamedTuple):
     above: Chance | None
 
 
-def slope(policies: Sequence[Mapping[str, Any]]) -> float:
-    """Return the slope of policies' returns over the reference's in the same episodes; 0 without one."""
-    if any(p.get("reference") is None for p in policies):
-        return 0.0
-    return luck_slope([p["returns"] for p in policies], [p["reference"] for p in policies])
+def luck(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Luck:
+    """Return how policies' returns follow the reference's in the same episodes; no luck without one."""
+    if reference is None or any(p.get("reference") is None for p in policies):
+        return Luck()
+    return luck_of([p["returns"] for p in policies], [p["reference"] for p in policies], reference.mean)
 
 
 def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Array:
@@ -109,6 +111,7 @@ def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]
     the environment's reference, whose mean return is known, has played the same ones. Its excess over that
     mean, times the slope of the agent's returns over the reference's, is subtracted (a control variate: the
     agent's expected return stays the same, and an agent uncorrelated with the reference keeps its returns).
+    Returns are left alone where that would not make their mean more certain, see `luck_of`.
 
     Parameters
     ----------
@@ -118,10 +121,10 @@ def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]
         The verified data of each policy: ``returns`` and, if the environment has one, ``reference``.
     """
     returns = np.array([p["returns"] for p in policies], np.float64)
-    along = slope(policies) if reference is not None else 0.0
-    if reference is None or not along:
+    slope = luck(reference, policies).slope
+    if reference is None or not slope:
         return returns
-    return returns - along * (np.array([p["reference"] for p in policies], np.float64) - reference.mean)
+    return returns - slope * (np.array([p["reference"] for p in policies], np.float64) - reference.mean)
 
 
 class Scores(NamedTuple):
@@ -132,7 +135,7 @@ class Scores(NamedTuple):
     table : ndarray, shape (policies, episodes)
         Scores corrected for luck.
     error : float
-        Standard error of the reference's mean, scaled to its effect on this row's score.
+        Standard error of the correction for luck, the same for all of the row's scores.
     """
 
     table: Array
@@ -146,17 +149,26 @@ class Scores(NamedTuple):
 
 def scored(scale: Scale, reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Scores:
     """Return the scores of verified policies, see `corrected`."""
-    table = normalised(scale, corrected(reference, policies))
-    if reference is None:
-        return Scores(table)
-    return Scores(table, abs(slope(policies)) * reference.error / abs(scale.best - scale.random))
+    error = common_error(reference, policies) / abs(scale.best - scale.random)
+    return Scores(normalised(scale, corrected(reference, policies)), error)
 
 
-def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float:
-    """Return the standard error of a policy's corrected mean return, averaged over the policies."""
+def common_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float:
+    """Return the standard error that the correction for luck brings into all corrected returns."""
+    found = luck(reference, policies)
+    return 0.0 if reference is None else math.hypot(found.slope * reference.error, found.error)
+
+
+def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the standard error of a policy's corrected mean return, averaged over the policies.
+
+    It is None for a single episode, which shows nothing of the spread.
+    """
     table = corrected(reference, policies)
-    error = 0.0 if reference is None else slope(policies) * reference.error
-    return float(np.hypot(table.std(axis=1).mean() / np.sqrt(table.shape[1]), error))
+    if table.shape[1] < 2:
+        return None
+    own = table.std(axis=1, ddof=1).mean() / math.sqrt(table.shape[1])
+    return math.hypot(own, common_error(reference, policies))
 
 
 def redrawn(id: str, scores: Scores) -> Array:

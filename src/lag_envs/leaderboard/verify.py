@@ -361,9 +361,9 @@ def result_lines(result: dict[str, Any]) -> list[str]:
         mean = float(corrected(reference, [policy]).mean())
         error = policy_error(reference, [policy])
         times = [t for t in policy["settle"] if t is not None]
-        part = score(env, mean)
+        part, spread = score(env, mean), "-" if error is None else f"{error:.2g}"
         lines.append(
-            f"  {policy['seed']:>6}  {mean:12.5g}  {error:7.2g}  {'' if part is None else f'{part:.4f}':>7}"
+            f"  {policy['seed']:>6}  {mean:12.5g}  {spread:>7}  {'' if part is None else f'{part:.4f}':>7}"
             f"  {np.mean(policy['success']):7.1%}  {f'{np.median(times):.2f} s' if times else '-':>7}"
             f"  {np.mean(policy['effort']):6.3f}"
         )
