@@ -265,3 +265,31 @@ def test_what_is_multiplied_by_hardly_anything_has_its_derivatives(mass, more):
     found = scene.vjp(state, 0.0, 0.02, [0.0, 1.0], parameters=["more"])
     for number in (by_control[1, 0], by_more[1, 0], found[1][0], found[2][0]):
         assert number == pytest.approx(exact, rel=1e-12 if more < 1e-9 else 1e-4)
+
+
+class SwingingAtwood(scenes.Scene):
+    """Two masses on a rope over a pulley; one of them swings."""
+
+    coordinates = {"r": "m", "theta": "rad"}
+
+    def kinetic(self, q, v, xp):
+        return 1.75 * v.r**2 + 0.5 * q.r**2 * v.theta**2
+
+    def potential(self, q, xp):
+        return 9.81 * q.r * (2.5 - xp.cos(q.theta))
+
+
+def test_what_needs_short_substeps_once_is_not_paid_for_ever():
+    """The rope nearly runs out at 0.084 s; after that substeps grow again."""
+    scene, no_control = SwingingAtwood(), np.zeros((2, 0))
+    states = np.array([[0.1, -1.0, 0.1, 0.5], [1.0, 0.2, 0.3, 0.1]])
+    found, _ = scene.jacobian(states, no_control, 0.1)
+    assert scene.step_bound(states[0], [], 0.1).substeps > 50
+    path, product = scene.simulate(states[0], 40, 0.0025), np.eye(4)
+    for state in path[:-1]:
+        product = scene.jacobian(state, [], 0.0025)[0] @ product
+    np.testing.assert_allclose(found[0], product, rtol=0.0, atol=2e-6 * np.abs(product).max())
+    seeds = np.random.default_rng(0).normal(size=(2, 4))
+    pulled, _ = scene.vjp(states, no_control, 0.1, seeds)
+    wanted = np.einsum("ni,nij->nj", seeds, found)
+    np.testing.assert_allclose(pulled, wanted, rtol=0.0, atol=1e-12 * np.abs(wanted).max())

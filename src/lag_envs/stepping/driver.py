@@ -173,8 +173,13 @@ def _enough(length, dt, rest, order):  # type: ignore[no-untyped-def]
     """
     if not (rest > ROUNDED and rest * dt > COMPLETE * length) or length < SHORT * dt:
         return np.inf
-    excess = rest / max(COMPLETE * length / dt, ROUNDED)
-    return length * max(0.05, 0.9 * excess ** (-1.0 / (order - 1)))
+    return next_length(length, dt, rest, order)
+
+
+def _next_length(length, dt, rest, order):  # type: ignore[no-untyped-def]
+    """Return the length of a substep with which derivatives leave out just little enough, see `_enough`."""
+    share = max(COMPLETE * length / dt, ROUNDED) / max(rest, 1e-300)
+    return length * min(4.0, max(0.05, 0.9 * share ** (1.0 / (order - 1))))
 
 
 def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-untyped-def]
@@ -218,6 +223,8 @@ def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-u
                     slopes[q + i] = rows[q + i]
                 for i in range(width):
                     sizes[i] = max(sizes[i], slopes[behind + width + i])
+                if longest < dt:  # what needed short substeps may be over
+                    longest = max(longest, next_length(used, dt, rest, order))
         if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
             return -np.int64(rows[status])
     return np.int64(rows[status])
@@ -251,15 +258,18 @@ def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def
 @cache
 def compile_advance_tangents(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents`."""
-    helpers = compile_attempt(record, 1), compile_series_tangent(record, columns), _compile_enough()
+    helpers = compile_attempt(record, 1), compile_series_tangent(record, columns), *_compile_lengths()
     numbers = _numbers(record, TOLERANCE)
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)
 
 
 @cache
-def _compile_enough() -> Callable:
-    return compile_python("enough_of", _enough, inner=True, COMPLETE=COMPLETE, ROUNDED=ROUNDED, SHORT=SHORT)
+def _compile_lengths() -> tuple[Callable, Callable]:
+    limits = {"COMPLETE": COMPLETE, "ROUNDED": ROUNDED}
+    next_length = compile_python("next_length", _next_length, inner=True, **limits)
+    enough_of = compile_python("enough_of", _enough, next_length, inner=True, SHORT=SHORT, **limits)
+    return enough_of, next_length
 
 
 def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
@@ -408,5 +418,5 @@ def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable
     width = lanes(record)
     numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
-    helpers = compile_pull(record, sources, width), _compile_enough(), *loops
+    helpers = compile_pull(record, sources, width), _compile_lengths()[0], *loops
     return compile_python("pull_all", _pull_all, *helpers, **numbers)

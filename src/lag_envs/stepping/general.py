@@ -345,23 +345,31 @@ class SeriesTangent:
         if self._stepper.mechanics.coupling:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
-        order = min(order + FURTHER, LARGEST_ORDER)
+        further = min(order + FURTHER, LARGEST_ORDER)
         linear = self._known_linear.get(dt) or self._linear(dt)
         self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
         given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
         found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
-        refused = self._pull(given, seeds, found, longest, *linear, dt, order)
-        (some,) = np.nonzero(longest < dt)
-        while len(some) and not refused:  # again those whose substeps were too long for the derivatives
-            shorter, again = longest[some], np.empty((self._width, len(some)))
-            parts = np.ascontiguousarray(given[:, some]), np.ascontiguousarray(seeds[:, some])
-            refused = self._pull(*parts, again, shorter, *linear, dt, order)
-            found[:, some] = again
-            refused = refused and int(some[refused - 1]) + 1
+        some = np.arange(len(states))
+        while len(some):  # again those whose substeps were too long for the derivatives
+            every = len(some) == len(states)
+            shorter, pulled = longest[some], found if every else np.empty((self._width, len(some)))
+            parts = (given, seeds) if every else (given[:, some].copy(), seeds[:, some].copy())
+            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further):
+                # Substeps backwards are no longer than the shortest of the step. Forwards they grow again.
+                i = some[refused - 1 : refused]
+                slopes, refused = self.jacobian(states[i], controls[i], dt, order)
+                if refused:
+                    return None, int(i[0]) + 1
+                found[:, i] = np.einsum("ni,nij->jn", cotangents[i], slopes)
+                some = np.setdiff1d(some, i)
+                continue
+            if not every:
+                found[:, some] = pulled
             too_long = shorter < longest[some]
             longest[some] = shorter
             some = some[too_long]
-        return (None if refused else found.T), refused
+        return found.T, 0
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
         """Return the constants, and derivatives of the series' start and of the end state, for `_pull`.
