@@ -178,7 +178,7 @@ def made_with_defaults(kind: type[Any], path: str) -> Any:
 
 
 def registered(name: str) -> list[str]:
-    """Return the ids of the tasks of ``FILE``, ``FILE:Class`` or ``module:Id``; those without an id get one."""
+    """Return the ids of ``FILE``, ``FILE:Class`` or ``module:Id``; tasks without an id get one."""
     import gymnasium as gym
 
     if not is_file(name):
