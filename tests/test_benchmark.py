@@ -132,7 +132,7 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--threads", "10000"], "--threads 10000 needs as many cores; this process may use"),
         (["bench", "--checkout", "nowhere"], f"{Path('nowhere/README.md')} is missing"),
         (["bench", "PivotedBar-v0", "--with", "wind=1"], "--with wind=1: got an unexpected keyword"),
-        (["fly"], "there is no command 'fly'; there are list, info"),
+        (["fly"], "there is no command 'fly'; did you mean play?"),
         (["lst"], "there is no command 'lst'; did you mean list?"),
         (["list", "PivotedBar"], "usage: lag-envs list"),
         (["info", "no_module:Id-v0"], "No module named 'no_module'"),

@@ -127,5 +127,5 @@ def test_what_is_no_task_is_told():
     env = make(incline.Tilt.id)
     for wrong in (incline.Tilt.id, env, incline.Tilt):
         for takes in (Model, MPC):
-            with pytest.raises(TypeError, match="takes a task, such as gym.make"):
+            with pytest.raises(TypeError, match=r"takes a task, such as gym\.make"):
                 takes(wrong)
