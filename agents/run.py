@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
 from hashlib import sha256
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -214,21 +213,12 @@ def own_env(name: str) -> str:
     UserError
         If there is none, or several.
     """
-    import gymnasium as gym
-
     from lag_envs import own_files
 
     if own_files.is_file(name):
         own_files.one(name)
         return own_files.registered(name)[0]
-    if ":" not in name:
-        return check_env(name)
-    module, _, env_id = name.partition(":")
-    try:
-        import_module(module)
-        return gym.spec(env_id).id
-    except (gym.error.Error, ImportError) as error:
-        raise UserError(f"there is no environment {name!r}: {error}") from error
+    return own_files.imported(name) if ":" in name else check_env(name)
 
 
 def known_name(kind: str, name: str, known: Iterable[str]) -> str:

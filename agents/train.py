@@ -59,7 +59,7 @@ separate episodes, is kept. For PPO it is the last one.
 
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
-  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
+  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml -f logs
 
 examples:
   python -m agents.train PivotedBar-v0                          one seed of PPO, in less than a minute

@@ -132,7 +132,11 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--threads", "10000"], "--threads 10000 needs as many cores; this process may use"),
         (["bench", "--checkout", "nowhere"], f"{Path('nowhere/README.md')} is missing"),
         (["bench", "PivotedBar-v0", "--with", "wind=1"], "--with wind=1: got an unexpected keyword"),
-        (["fly"], "invalid choice: 'fly'"),
+        (["fly"], "there is no command 'fly'; did you mean play?"),
+        (["lst"], "there is no command 'lst'; did you mean list?"),
+        (["list", "PivotedBar"], "usage: lag-envs list"),
+        (["info", "no_module:Id-v0"], "No module named 'no_module'"),
+        (["info", "gymnasium:CartPole-v1"], "gymnasium:CartPole-v1 is no task of lag_envs"),
     ],
 )
 def test_mistakes_are_told_without_a_traceback(arguments, message, capsys):

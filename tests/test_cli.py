@@ -156,6 +156,16 @@ def test_list_says_what_is_to_be_done(capsys):
     assert f"{cart_pole.CartPoleExact.id}  " in out and f" {choices[0]:g} or {choices[-1]:g} N " in out
 
 
+def test_info_takes_a_module_and_tells_what_is_observed(capsys):
+    assert cli.main(["info", f"lag_envs:{ID}"]) == 0
+    assert re.search(r"theta_dot/8 .*rad/s  angular velocity, divided by 8", capsys.readouterr().out)
+
+
+def test_python_runs_the_package():
+    done = subprocess.run([sys.executable, "-m", "lag_envs", "--version"], capture_output=True, check=True)
+    assert done.stdout.startswith(b"lag-envs ")
+
+
 def test_info_names_the_agents(capsys):
     assert cli.main(["info", ID]) == 0
     out = capsys.readouterr().out

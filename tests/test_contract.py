@@ -151,7 +151,13 @@ def test_state_follows_from_the_names_of_the_controls(controls, names):
     assert layout(controls)[0] == tuple(names.split())
 
 
-def test_units_are_never_read():
+@pytest.mark.parametrize("unit", ["radians", "radian", "Rad", "deg", "degrees", "°", "deg/s"])
+def test_angles_are_in_rad(unit):
+    with pytest.raises(FormulaError, match=f"the unit of 's_ddot' is '{unit}'; write 'rad'"):
+        layout({"s_ddot": unit})
+
+
+def test_other_units_are_never_read():
     assert layout({"s_ddot": "acres", "h_ddot": ""})[1] == (
         "furlong", "furlong/s", "", "1/s", "m", "m/s", "rad", "rad/s"
     )  # fmt: skip

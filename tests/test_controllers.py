@@ -599,3 +599,23 @@ def test_the_adaptive_controller_needs_something_to_adapt_to():
         AdaptiveEnergyShapingLQR(make_task("PivotedBar-v0"))
     with pytest.raises(ValueError, match="late by a whole number of control steps"):
         AdaptiveEnergyShapingLQR(make_task(pivoted_bar.SwingUpUnknown.id, action_delay=0.013))
+
+
+def test_an_observation_that_is_not_finite_is_named():
+    agent = make_controller(BAR, "energy shaping + LQR")
+    bad = np.zeros((2, 5), np.float32)
+    bad[1, 4] = np.nan
+    with pytest.raises(ValueError, match="observation 'theta_dot/8' must be finite, got nan in row 1"):
+        agent.predict(bad)
+    with pytest.raises(ValueError, match="observation must be numbers, got 'a'"):
+        agent.predict("a")
+
+
+def test_a_score_needs_an_environment_and_a_number():
+    with pytest.raises(ValueError, match="no environment 'PivotedBr-v0'; did you mean PivotedBar-v0"):
+        score("PivotedBr-v0", 1)
+    with pytest.raises(ValueError, match="mean_return must be finite, got nan"):
+        score(BAR, np.nan)
+    with pytest.raises(ValueError, match="mean_return must be a real number, got 'a'"):
+        score(BAR, "a")
+    assert score("CartPole-v1", 1.0) is None

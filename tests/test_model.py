@@ -10,6 +10,7 @@ import pytest
 from covering import PERFECT, covering, engine, slow
 from rollouts import actions, make
 
+from lag_envs.controllers.mpc import MPC
 from lag_envs.envs.model import Model
 from lag_envs.scenes import StepRefused
 from lag_envs.tasks import TASKS, incline, pivoted_bar
@@ -120,3 +121,11 @@ def test_expansion_needs_actions_between():
 
     with pytest.raises(ValueError, match="Choices has a list of actions to choose from"):
         Model(Choices(track=None)).expand([[0.0, 0.0]], [0.0])
+
+
+def test_what_is_no_task_is_told():
+    env = make(incline.Tilt.id)
+    for wrong in (incline.Tilt.id, env, incline.Tilt):
+        for takes in (Model, MPC):
+            with pytest.raises(TypeError, match=r"takes a task, such as gym\.make"):
+                takes(wrong)

@@ -125,6 +125,11 @@ def test_every_changed_character_is_noticed():
             replay.read_link(link[:i])
 
 
+def test_what_is_no_drive_is_told():
+    with pytest.raises(TypeError, match="takes a Drive or the text of a link, got 3"):
+        replay.replay(3)
+
+
 def test_the_command(capsys):
     drive = driven(TASKS[ID]())
     assert cli.main(["replay", replay.write_link(drive, "https://example.org/x.html")]) == 0

@@ -653,3 +653,8 @@ def test_it_tells_limits_and_which_episodes_are_over():
     for _ in range(2):
         envs.step(envs.action_space.sample())
     assert envs.ended.tolist() == [True] * 3
+
+
+def test_far_too_many_environments_are_told():
+    with pytest.raises(MemoryError, match=r"num_envs=10{15}: the list of tasks alone takes 7.45e.06 GiB"):
+        gym.make_vec("PivotedBar-v0", num_envs=10**15)

@@ -121,6 +121,15 @@ def test_missing_display_is_named(monkeypatch):
     env.close()
 
 
+def test_a_window_that_nobody_sees_is_not_opened(monkeypatch):
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    monkeypatch.setattr(pygame.display, "init", lambda: None)
+    monkeypatch.setattr(pygame.display, "set_mode", lambda size: None)
+    monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
+    with pytest.raises(gym.error.Error, match="no display here; `lag-envs watch ID --video FILE`"):
+        screen._open_window(10, 10)
+
+
 def test_missing_pygame_is_named_with_its_remedy(monkeypatch):
     env = gym.make("PivotedBar-v0", render_mode="rgb_array")
     written = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True)

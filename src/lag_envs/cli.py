@@ -21,7 +21,7 @@ from lag_envs.commands.new import NEW
 from lag_envs.commands.order import ORDER
 from lag_envs.commands.report import REPORT
 from lag_envs.commands.show import PLAY, WATCH
-from lag_envs.errors import run_shown
+from lag_envs.errors import UserError, hint, run_shown
 
 #: In the order of ``lag-envs --help``.
 COMMANDS: tuple[Command, ...] = (
@@ -64,7 +64,7 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
         )
         if command_name in (None, command.name):
             command.declare(one)
-        one.set_defaults(run=command.run, parser=parser)
+        one.set_defaults(run=command.run, parser=parser, refuse=one.error)
     return whole
 
 
@@ -74,7 +74,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(given: Sequence[str]) -> int:
-    args = parser(next((word for word in given if not word.startswith("-")), "")).parse_args(given)
+    name, names = next((word for word in given if not word.startswith("-")), ""), [c.name for c in COMMANDS]
+    if name and name not in names:
+        raise UserError(f"there is no command {name!r}; {hint(name, names)}")
+    whole = parser(name)
+    args, unknown = whole.parse_known_args(given)
+    if unknown:
+        vars(args).get("refuse", whole.error)(f"unrecognized arguments: {' '.join(unknown)}")
     if "run" not in args:
         parser("").print_help(sys.stderr)
         return 2

@@ -51,7 +51,7 @@ def facts(task: Task, name: str, formulas: str) -> list[str]:
     text += [
         "",
         "Observation and its bounds",
-        *_indented([(n, _bound(low, high)) for n, low, high in bounds]),
+        *_indented([(n, _bound(low, high), *task.quantities.get(n, ("", ""))) for n, low, high in bounds]),
     ]
     text += ["", "Start (uniform, unless reset(options={'state': ...}))", *_indented(_starts(task))]
     text += ["", "Parameters, keywords of gym.make", *_indented(_parameters(task))]

@@ -178,9 +178,11 @@ def made_with_defaults(kind: type[Any], path: str) -> Any:
 
 
 def registered(name: str) -> list[str]:
-    """Return the ids of the tasks of ``FILE`` or ``FILE:Class``; those without an id get one."""
+    """Return the ids of ``FILE``, ``FILE:Class`` or ``module:Id``; tasks without an id get one."""
     import gymnasium as gym
 
+    if not is_file(name):
+        return [imported(name)]
     ids = []
     for kind in chosen_tasks(name).values():
         made_with_defaults(kind, name)
@@ -190,6 +192,18 @@ def registered(name: str) -> list[str]:
             register(kind, id=id)
         ids.append(id)
     return ids
+
+
+def imported(name: str) -> str:
+    """Import the module of ``module:Id`` and return the id, or raise a UserError."""
+    import gymnasium as gym
+
+    module, _, env_id = name.partition(":")
+    try:
+        importlib.import_module(module)
+        return gym.spec(env_id).id
+    except (gym.error.Error, ImportError, ValueError) as error:
+        raise UserError(f"there is no environment {name!r}: {error}") from error
 
 
 def _place(kind: type[Any]) -> str:

@@ -164,6 +164,8 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     ------
     LinkError
         If the link is damaged, or its drive is impossible.
+    TypeError
+        For neither a drive nor a link.
     """
     from lag_envs.envs.unfused import Unfused
     from lag_envs.mechanics.algebra import FormulaError
@@ -172,6 +174,8 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     from lag_envs.tasks import TASKS
 
     drive = read_link(drive) if isinstance(drive, str) else drive
+    if not isinstance(drive, Drive):
+        raise TypeError(f"replay takes a Drive or the text of a link, got {drive!r:.80}")
     if task is None:
         if drive.id not in TASKS:
             raise LinkError(f"there is no environment {_short(drive.id)}; {hint(drive.id, TASKS)}")

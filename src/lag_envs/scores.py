@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.errors import hint
+from lag_envs.scenes.checks import check_number
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured_entry
 
@@ -88,13 +91,22 @@ def score(env_id: str, mean_return: float) -> float | None:
         The score, not clipped: below 0 is worse than random, above 1 better than the best known. None for an
         environment without known returns.
 
+    Raises
+    ------
+    ValueError
+        For an unknown id, and a return that is not a finite number.
+
     Examples
     --------
     >>> score("PivotedBar-v0", 419.01)
     1.0
     """
     known = known_returns(env_id)
-    return None if known is None else float(normalised(known, mean_return))
+    if known is None:
+        if env_id not in gym.registry:
+            raise ValueError(f"there is no environment {env_id!r}; {hint(env_id, TASKS)}")
+        return None
+    return float(normalised(known, check_number("mean_return", mean_return)))
 
 
 def share_of_privileged(env_id: str) -> float | None:

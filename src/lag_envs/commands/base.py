@@ -11,11 +11,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
+
 from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
+from lag_envs.own_files import imported
 
-#: Alternative to ids in `report`, `info`, `bench` and `play`.
+#: Alternative to ids in `report`.
 OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
+#: Alternatives to ids in `info`, `bench`, `order`, `play` and `watch`.
+OWN_OR_MODULE = f"module:ID, which imports the module, or {OWN}"
 
 
 class Command(NamedTuple):
@@ -29,9 +34,16 @@ class Command(NamedTuple):
 
 
 def known_id(id: str) -> str:
-    """Return the id, or raise a UserError that names similar ones."""
+    """Return the id for ID or module:ID, or raise a UserError that names similar ones."""
     if id in TASKS:
         return id
+    if ":" in id:
+        found = imported(id)
+        if "task" not in gym.spec(found).kwargs:
+            raise UserError(
+                f"{id} is no task of lag_envs; lag_envs.register(Task) makes an environment of one"
+            )
+        return found
     raise UserError(
         f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')} "
         "(a file of your own ends with .py)"

@@ -6,7 +6,15 @@ import argparse
 from collections.abc import Sequence
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, check_checkout, declare_date, known_id, needs, seconds
+from lag_envs.commands.base import (
+    OWN_OR_MODULE,
+    Command,
+    check_checkout,
+    declare_date,
+    known_id,
+    needs,
+    seconds,
+)
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.options import count, new_file
@@ -19,7 +27,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "ids",
         metavar="ID",
         nargs="*",
-        help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN}",
+        help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN_OR_MODULE}",
     )
     parser.add_argument(
         "--quick", action="store_true", help="fewer and shorter samples, no cold start: under a minute"
@@ -144,13 +152,13 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
 
 
 def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the requested ids, and the names that are files."""
+    """Return the requested ids, and the names whose code has to be run first."""
     from lag_envs import own_files
 
-    files = tuple(dict.fromkeys(name for name in names if is_file(name)))
+    files = tuple(dict.fromkeys(name for name in names if is_file(name) or ":" in name))
     ids: list[str] = []
     for name in names:
-        ids += own_files.registered(name) if name in files else [known_id(name)]
+        ids += own_files.registered(name) if is_file(name) else [known_id(name)]
     return tuple(dict.fromkeys(ids)), files
 
 

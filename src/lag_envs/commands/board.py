@@ -39,7 +39,7 @@ EXPORT = Command(
     "export",
     "turn a trained model into a submission",
     """Turn models of Stable-Baselines3 into a submission to the leaderboard, which contains only data, and
-prove that both act alike. Loading a model runs code, so export only your own. Networks from
+check that both act alike. Loading a model runs code, so export only your own. Networks from
 `python -m agents.ppo` are data already, and are taken as they are.
 
 examples:

@@ -35,9 +35,9 @@ fast_ppo, shac and cloning are for `python -m agents.train`, in a clone.
 
 examples:
   lag-envs hyperparams ppo > ppo.yml
-  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
+  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml -f logs
   python -m rl_zoo3.enjoy --algo ppo --env PivotedBar-v0 --gym-packages lag_envs -f logs
-  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs""",
+  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 --gym-packages lag_envs -f logs""",
     declare_hyperparams,
     run_hyperparams,
 )

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, known_id
+from lag_envs.commands.base import OWN_OR_MODULE, Command, known_id
 from lag_envs.own_files import is_file
 from lag_envs.tables import aligned
+from lag_envs.tasks.registration import make_task
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -49,7 +50,7 @@ def _range(task: Task, acting: Any) -> str:
 
 def declare_info(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``info``."""
-    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN}")
+    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN_OR_MODULE}")
 
 
 def run_info(args: argparse.Namespace) -> int:
@@ -63,7 +64,7 @@ def run_info(args: argparse.Namespace) -> int:
         name, formulas = task.id or type(task).__name__, f"see {args.id}"
     else:
         name = known_id(args.id)
-        task = TASKS[name]()
+        task = make_task(name)
         formulas = f"python -m pydoc {type(task).__module__}.{type(task).__name__}"
     print("\n".join(facts(task, name, formulas)))
     print("\n".join(_agents(task, name, args.id)))

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, known_id
+from lag_envs.commands.base import OWN_OR_MODULE, Command, known_id
 from lag_envs.options import count
 from lag_envs.own_files import is_file
 from lag_envs.scenes.derivation import order_of
+from lag_envs.tasks.registration import make_task
 
 
 def declare_order(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``order``."""
-    parser.add_argument("id", metavar="ID", help=f"an environment, or {OWN}")
+    parser.add_argument("id", metavar="ID", help=f"an environment, or {OWN_OR_MODULE}")
     parser.add_argument(
         "--num-envs", metavar="N", type=count, default=1024, help="size of the batch (default: 1024)"
     )
@@ -30,7 +30,7 @@ def run_order(args: argparse.Namespace) -> int:
         kind = own_files.one(args.id)
         own_files.made_with_defaults(kind, args.id)
     else:
-        kind = TASKS[known_id(args.id)]
+        kind = type(make_task(known_id(args.id)))
     with progress(args.rounds * len(ORDERS)) as advance:
         times = measure_orders(kind, args.num_envs, args.rounds, advance=lambda: advance(kind.__name__))
     print("\n".join(lines(kind, times, order_of(kind().scene, kind().dt))))

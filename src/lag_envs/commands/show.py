@@ -7,8 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, known_id, needs, seconds
+from lag_envs.commands.base import OWN_OR_MODULE, Command, known_id, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.options import count
 from lag_envs.own_files import is_file
@@ -49,7 +48,10 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         " that comes with the package)",
     )
     parser.add_argument(
-        "--episodes", metavar="N", type=count, help="number of episodes (default: 1 in a video, else endless)"
+        "--episodes",
+        metavar="N",
+        type=count,
+        help="number of episodes (default: 1 with --video, otherwise no end)",
     )
     parser.add_argument(
         "--video", metavar="FILE", type=Path, help="write an .mp4 or .gif instead of opening a window"
@@ -87,16 +89,16 @@ def run_watch(args: argparse.Namespace) -> int:
             watch.watch(id, agent, seed=seed, **limits, **_look(args))
         if args.video is not None:
             print(f"{args.video} is written")
-    except ValueError as error:
+    except (Error, ValueError) as error:
         raise UserError(str(error)) from error
-    except Error as error:
-        raise UserError(f"{error}, nor does --video FILE") from error
     return 0
 
 
 def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     """Declare the arguments of all commands that show an environment."""
-    parser.add_argument("id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN}")
+    parser.add_argument(
+        "id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN_OR_MODULE}"
+    )
     parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
     parser.add_argument("--steps", metavar="N", type=count, help="end after N steps (default: no end)")
     parser.add_argument("--arrows", action="store_true", help="show arrows for controls and forces")
@@ -123,7 +125,7 @@ def _shown(args: argparse.Namespace) -> tuple[str, Task]:
     if args.seed is not None and args.seed < 0:
         raise UserError(f"--seed must be at least 0, got {args.seed}")
     if not is_file(args.id):
-        return (id := known_id(args.id)), TASKS[id]()
+        return (id := known_id(args.id)), make_task(id)
     task, path = own_files.one(args.id), own_files.split_path(args.id)[0]
     (id,) = own_files.registered(f"{path}:{task.__name__}")
     return id, make_task(id)

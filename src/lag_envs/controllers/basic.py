@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
 from lag_envs.errors import hint
+from lag_envs.scenes.checks import shown
 from lag_envs.scenes.derivation import form_of, layout_of
-from lag_envs.tasks.base import Task
+from lag_envs.tasks.base import Task, check_task
 from lag_envs.tasks.formulas import Lifted, TaskFormulas
 
 Array = NDArray[np.float64]
@@ -76,7 +77,8 @@ class Feedback:
     """
 
     def __init__(self, task: Task, *, gain: ArrayLike) -> None:
-        self.gain, self.largest = np.atleast_2d(np.asarray(gain, np.float64)), task.formulas.largest
+        self.task, self.largest = task, task.formulas.largest
+        self.gain = np.atleast_2d(np.asarray(gain, np.float64))
         if self.gain.shape != (wanted := (task.formulas.actions, len(task.observation))):
             raise ValueError(f"gain must have shape {wanted}, got {self.gain.shape}")
 
@@ -84,7 +86,8 @@ class Feedback:
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action, for each observation."""
-        return np.clip(observation @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
+        values = check_observation(self.task, observation)
+        return np.clip(values @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
 
     def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback."""
@@ -120,7 +123,7 @@ class Switch:
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray, Any]:
         """Return the action for each observation."""
-        side = np.where(observation @ self.weights < 0.0, -1.0, 1.0)
+        side = np.where(check_observation(self.task, observation) @ self.weights < 0.0, -1.0, 1.0)
         return actions_for(self.task, side * self.task.limit_control), state
 
 
@@ -261,6 +264,25 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
     return scale, -0.5 * scale * (high + low)
 
 
+def check_observation(task: Task, observation: ArrayLike) -> Array:
+    """Return observations (..., n) as float64; raise a ValueError for another shape or numbers not finite."""
+    names = list(task.observation)
+    try:
+        values = np.asarray(observation, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the observation must be numbers, got {shown(observation)}") from error
+    if values.shape[-1:] != (len(names),):
+        raise ValueError(
+            f"observations of {type(task).__name__} must have shape (..., {len(names)}) for "
+            f"{', '.join(names)}; got {values.shape}"
+        )
+    if not np.isfinite(values).all():
+        place = np.argwhere(~np.isfinite(values))[0]
+        row = f" in row {', '.join(map(str, place[:-1]))}" if len(place) > 1 else ""
+        raise ValueError(f"the observation {names[place[-1]]!r} must be finite, got {values[*place]}{row}")
+    return values
+
+
 def check_count(name: str, number: Any, least: int = 1) -> None:
     """Raise a ValueError for a number that is not whole, or too small."""
     if not isinstance(number, (int, np.integer)) or number < least:
@@ -282,7 +304,8 @@ def check_continuous(what: str, task: Task) -> None:
 
 
 def check_acts(what: str, task: Task) -> None:
-    """Raise a ValueError for a task without actions."""
+    """Raise a ValueError for a task without actions, and a TypeError for what is no task."""
+    check_task(what, task)
     if not task.formulas.actions:
         raise ValueError(f"{what} has nothing to do: {type(task).__name__} has no control to act with")
 
@@ -332,6 +355,7 @@ class ObservationDecoder:
     """
 
     def __init__(self, task: Task, *, complete: bool = False) -> None:
+        check_task("a controller", task)
         formulas, form = task.formulas, form_of(task.scene)
         k = SimpleNamespace(**formulas.constants())
         self.task, self._n = task, len(task.scene.state_names)
@@ -399,13 +423,7 @@ class ObservationDecoder:
 
         Targets have the shape (...), and are 0 if there are none, or (..., n_targets) if there are several.
         """
-        values = np.asarray(observation, np.float64)
-        if values.shape[-1:] != self._zero.shape:
-            raise ValueError(
-                f"observations of {type(self.task).__name__} must have shape (..., {len(self._zero)}) for "
-                f"{', '.join(self.task.observation)}; got {values.shape}"
-            )
-        lifted = (values - self._zero) @ self._inverse
+        lifted = (check_observation(self.task, observation) - self._zero) @ self._inverse
         state = lifted[..., : self._n].copy()
         for i, j in self._pairs:
             state[..., i] = np.arctan2(lifted[..., j + 1], lifted[..., j])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder
+from lag_envs.controllers.basic import Array, ObservationDecoder, check_observation
 from lag_envs.controllers.mpc import renewed
 from lag_envs.controllers.tracking import follow, recorded
 from lag_envs.envs.model import Model
@@ -75,7 +75,7 @@ class Filtered:
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Belief]:  # fmt: skip
         """Return the action for each observation, and the belief after it."""
-        values = np.asarray(observation, np.float64)
+        values = check_observation(self.task, observation)
         batch = values.reshape(-1, values.shape[-1])
         x = np.tile(np.asarray(self.task.centre, np.float64), (len(batch), 1))
         covariance = np.tile(self.prior, (len(batch), 1, 1))

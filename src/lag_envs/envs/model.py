@@ -14,7 +14,7 @@ from lag_envs.envs.reverse import Reverse
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import absent_from
-from lag_envs.tasks.base import Task
+from lag_envs.tasks.base import Task, check_task
 
 Array = NDArray[np.float64]
 
@@ -84,6 +84,7 @@ class Model:
     """
 
     def __init__(self, task: Task) -> None:
+        check_task("Model", task)
         self.task = task
         constants = task.formulas.constants()
         program = program_for(task, absent_from(constants))

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import pygame
 
 
+#: What to do without a window.
+REMEDY = '`lag-envs watch ID --video FILE` writes a video, render_mode="rgb_array" gives pictures'
+
+
 @cache
 def load_pygame() -> Any:
     """Return pygame, or raise an error that tells how to install it."""
@@ -94,7 +98,11 @@ def _open_window(width: int, height: int) -> pygame.Surface:
         pygame.display.init()
         screen = pygame.display.set_mode((width, height))
     except pygame.error as error:
-        raise Error(f'no window can be opened ({error}); render_mode="rgb_array" needs none') from error
+        raise Error(f"no window can be opened ({error}); {REMEDY}") from error
+    # Where there is no display, SDL opens a window that nobody sees.
+    if pygame.display.get_driver() in ("offscreen", "dummy") and not os.environ.get("SDL_VIDEODRIVER"):
+        pygame.display.quit()
+        raise Error(f"there is no display here; {REMEDY}")
     pygame.display.set_caption("lag_envs")
     return screen
 

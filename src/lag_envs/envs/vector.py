@@ -713,7 +713,13 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
         if name in ("control", "dt", "duration"):
             raise ValueError(f"{name} must be the same for all environments, got {shown(values)}")
     if not many:
-        return [kind(**options)] * n
+        task = kind(**options)
+        try:
+            return [task] * n
+        except MemoryError as error:
+            raise MemoryError(
+                f"num_envs={n}: the list of tasks alone takes {8 * n / 2**30:.3g} GiB"
+            ) from error
     own = [options | {name: values[i] for name, values in many.items()} for i in range(n)]
     tasks = [for_environment(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:

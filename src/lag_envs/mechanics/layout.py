@@ -1,7 +1,8 @@
 """A scene's declarations: coordinates, controls and state, with every name and unit checked or derived.
 
-Units are never interpreted. The name of a control decides what it does: ``s_ddot``, ``s_dot`` or ``s`` moves
-a prescribed coordinate ``s``. The unit of a rate is that of the coordinate with ``/s`` appended.
+Of units only ``rad`` has a meaning: a coordinate with it is an angle. The name of a control decides what it
+does: ``s_ddot``, ``s_dot`` or ``s`` moves a prescribed coordinate ``s``. The unit of a rate is that of the
+coordinate with ``/s`` appended.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from lag_envs.mechanics.algebra import FormulaError
 
 #: What a control sets of a prescribed coordinate; ``"rest"`` if no control does.
 Level = Literal["acceleration", "rate", "place", "rest"]
+
+#: Other spellings of radians, which would not be taken for an angle, and degrees.
+_NOT_RAD = ("radian", "radians", "rads", "deg", "degree", "degrees", "°")
 
 _ENDINGS: tuple[tuple[str, Level], ...] = (("_ddot", "acceleration"), ("_dot", "rate"), ("", "place"))
 
@@ -104,6 +108,11 @@ def units(where: str, value: Any) -> dict[str, str]:
         check_name(where, name)
         if not isinstance(unit, str):
             raise FormulaError(f"{where}: the unit of {name!r} must be text, got {unit!r}")
+        angle = unit.partition("/")[0].strip().lower()
+        if angle in _NOT_RAD or (angle == "rad" and not unit.startswith("rad")):
+            raise FormulaError(
+                f"{where}: the unit of {name!r} is {unit!r}; write 'rad', as energies are written in radians"
+            )
     return dict(value)
 
 

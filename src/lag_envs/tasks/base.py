@@ -20,7 +20,7 @@ from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import Scene
-from lag_envs.scenes.checks import check_number, check_state, real_array
+from lag_envs.scenes.checks import check_number, check_state, real_array, shown
 from lag_envs.scenes.declaring import ORDER, complete
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, structure_of
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
@@ -542,6 +542,12 @@ class Task:
             Reading(t.name, float(value), t.unit, "target")
             for t, value in zip(self.formulas.target_boxes, given, strict=False)
         ]
+
+
+def check_task(what: str, task: Any) -> None:
+    """Raise a TypeError for what is no task, such as an id or an environment."""
+    if not isinstance(task, Task):
+        raise TypeError(f"{what} takes a task, such as gym.make(ID).unwrapped.task, got {shown(task)}")
 
 
 @cache
