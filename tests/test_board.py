@@ -438,6 +438,11 @@ def test_coarse_value_functions():
     assert coarse(incline.Brake.id, None)["axes"][1]["label"] == "x_dot"
 
 
+def test_a_board_that_does_not_exist(board):
+    with pytest.raises(BoardError, match=r"there is no board in .*add FOLDER --board .* begins one there"):
+        board.read()
+
+
 def test_an_empty_board(board):
     assert all(not e["rows"] and not e["other"] for e in board_data(board)["environments"])
     assert not board.folder.exists()
