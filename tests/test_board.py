@@ -130,7 +130,7 @@ def test_withdrawn(board):
     with pytest.raises(BoardError, match="was withdrawn before"):
         board.withdraw(id, "again")
     with pytest.raises(BoardError, match="there is no 'nobody' on the board"):
-        board.withdraw("nobody", "")
+        board.withdraw("nobody", "x")
     board.verified(id, {"nonce": "1"})  # comes too late
     board.rejected(id, "")
     assert states(board) == {id: "withdrawn"}

@@ -190,7 +190,9 @@ def test_mistakes(run):
 )
 def test_a_board_that_does_not_exist(run, action):
     status, out, err = run(*action.split(), "--board", "my typo")
-    assert (status, out) == (2, "") and f"{remedy} --board 'my typo'` begins one there" in err
+    assert (status, out) == (2, "")
+    assert "there is no board in my typo; --board names the folder of one, and `lag-envs" in err
+    assert "leaderboard add FOLDER --board 'my typo'` begins one there" in err
     Path("file").write_text("")
     assert "file is a file; a board is a folder" in run(*action.split(), "--board", "file")[2]
     assert os.listdir() == ["file"]
@@ -199,9 +201,7 @@ def test_a_board_that_does_not_exist(run, action):
 def test_a_new_board_is_told(run):
     assert run("open", "--board", "new")[1].startswith("new is a new board\nprotocol 1;")
     assert "new board" not in run("open", "--board", "new")[1]
-    assert run("list", "--board", "new")[2].endswith(
-        "`lag-envs leaderboard add FOLDER --board new` adds one\n"
-    )
+    assert run("list", "--board", "new")[2].endswith("add FOLDER --board new` adds one\n")
     assert run("add", write("bad", refuse="why"), "--board", "other")[1] == ""
     assert not Path("other").exists()
 
@@ -238,9 +238,8 @@ def test_build(run):
     assert any("An agent" in path.read_text(encoding="utf-8") for path in Path("page").glob("*.html"))
     Path("other").mkdir()
     Path("other/index.html").write_text("mine")
-    assert (
-        "my.py is a file; name a folder for the page" in (Path("my.py").touch(), run("build", "my.py"))[1][2]
-    )
+    Path("my.py").touch()
+    assert "my.py is a file; name a folder for the page" in run("build", "my.py")[2]
     assert "--url: the page's address must begin with https://" in run("build", "--url", "ftp://a")[2]
     status, _, err = run("build", "other")
     assert status == 2 and "other holds other things, such as index.html; name a new or an empty" in err
