@@ -312,7 +312,7 @@ def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):
 def test_the_whole_command_measures_in_a_process_of_its_own(tmp_path):
     output = tmp_path / "speed.json"
     command = [sys.executable, "-m", "lag_envs.cli", "bench", ID, "--quick", "--sizes", "1", "--rounds", "1"]
-    command += ["--seconds", "1e-4", "--date", "today", "--output", str(output)]
+    command += ["--seconds", "1e-4", "--date", "2026-01-31", "--output", str(output)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")
     report = json.loads(output.read_text())

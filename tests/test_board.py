@@ -130,7 +130,7 @@ def test_withdrawn(board):
     with pytest.raises(BoardError, match="was withdrawn before"):
         board.withdraw(id, "again")
     with pytest.raises(BoardError, match="there is no 'nobody' on the board"):
-        board.withdraw("nobody", "")
+        board.withdraw("nobody", "x")
     board.verified(id, {"nonce": "1"})  # comes too late
     board.rejected(id, "")
     assert states(board) == {id: "withdrawn"}
@@ -436,6 +436,11 @@ def test_coarse_value_functions():
     best = max(range(theta["n"]), key=lambda i: value["values"][i][theta_dot["n"] // 2])
     assert best == theta["n"] // 2  # upright
     assert coarse(incline.Brake.id, None)["axes"][1]["label"] == "x_dot"
+
+
+def test_a_board_that_does_not_exist(board):
+    with pytest.raises(BoardError, match=r"there is no board in .*add FOLDER --board .* begins one there"):
+        board.read()
 
 
 def test_an_empty_board(board):

@@ -340,6 +340,10 @@ def test_unknown_names_get_hints():
         make_controller(BALANCE, "xyz")
     with pytest.raises(TypeError, match="unexpected keyword argument 'weight'"):
         make_controller(BALANCE, "LQR", weight=1.0)
+    with pytest.raises(TypeError, match=r"an environment's id is needed.*controllers\.build takes a task"):
+        make_controller(TASKS[BALANCE](), "LQR")
+    with pytest.raises(TypeError, match="a controller's name is needed, got None; there are zero, random"):
+        make_controller(BALANCE, None)
 
 
 class Lopsided(cart_pole.CartPoleContinuous):

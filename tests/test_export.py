@@ -166,8 +166,20 @@ def test_networks_of_our_own_are_called_by_their_learners(algo, name, tmp_path):
         np.savez(there, choices=False, weight_0=np.zeros((1, 4)), bias_0=np.zeros(1))
     source = export.Source(file, result={"algo": algo} if algo else None)
     assert export._name(source, None) == name
-    with pytest.raises(export.ExportError, match="holds a network, not a model; leave --algo out"):
-        export._name(source, "sac")
+    with pytest.raises(export.ExportError, match="--algo is for models of Stable-Baselines3"):
+        export.exported(source, ENV, "sac")
+
+
+@pytest.mark.parametrize(("option", "value"), [("frames", 4), ("algo", "sac"), ("normalise", "norm.pkl")])
+def test_options_for_models_are_refused_for_networks(option, value, tmp_path):
+    from lag_envs.errors import UserError
+
+    file = tmp_path / "model.zip"
+    with open(file, "wb") as there:
+        np.savez(there, choices=False, weight_0=np.zeros((1, 4)), bias_0=np.zeros(1))
+    given = [file, "--author", "A", "--license", "MIT", "--env", ENV, "--name", "x", "--seconds", 1]
+    with pytest.raises(UserError, match=f"--{option} is for models of Stable-Baselines3; .* holds a network"):
+        export_command(*given, f"--{option}", value)
 
 
 def test_command_exports_files(runs, tmp_path):

@@ -24,6 +24,7 @@ from lag_envs.leaderboard import alike, audit, docs, protocol
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.log import STATES
 from lag_envs.leaderboard.standings import board_data
+from lag_envs.tables import columns
 from lag_envs.tasks import incline
 
 ROOT = Path(__file__).parents[1]
@@ -56,7 +57,8 @@ def test_from_adding_to_the_ranking(run):
     status, out, _ = run("add", "a")
     (id,) = ids()
     assert status == 0
-    assert out == f"{id}: pending, until a nonce is published: `lag-envs leaderboard nonce`\n"
+    waits = f"{id}: pending, until a nonce is published: `lag-envs leaderboard nonce`\n"
+    assert out == "leaderboard is a new board\n" + waits
     beacon = "https://api.drand.sh/public/1234"
     assert run("nonce", "drand-1234", "--source", beacon) == (0, f"nonce: drand-1234\n{id}: verified\n", "")
     assert run("add", "a")[1] == f"{id}: is there already, verified\n"
@@ -73,7 +75,8 @@ def test_from_adding_to_the_ranking(run):
 def test_add_with_a_nonce(run):
     folders = [write(name, name) for name in ("a", "b")]
     status, out, _ = run("add", *folders, "--nonce", "test-1")
-    assert status == 0 and out == "nonce: test-1\n" + "".join(f"{id}: verified\n" for id in ids())
+    verified = "".join(f"{id}: verified\n" for id in ids())
+    assert status == 0 and out == "leaderboard is a new board\nnonce: test-1\n" + verified
 
 
 def test_what_is_refused_is_told_and_costs_the_others_nothing(run):
@@ -146,6 +149,8 @@ def test_withdraw(run):
     (id,) = ids()
     status, _, err = run("withdraw", id, "--reason", "wrong\x1b[2J numbers")
     assert status == 2 and "this cannot be logged: withdrawn.reason: it holds the invisible U+001B" in err
+    status, _, err = run("withdraw", id, "--reason", " ")
+    assert status == 2 and "a reason is needed" in err
     assert run("withdraw", id, "--reason", "wrong numbers")[0] == 0
     assert f"{id} withdrawn: wrong numbers" in run("list")[1]
     assert run("withdraw", id, "--reason", "x") == (2, "", f"lag-envs: error: {id} was withdrawn before\n")
@@ -163,16 +168,13 @@ def test_mistakes(run):
             with pytest.raises(SystemExit) as left:
                 run(*arguments)
             assert left.value.code == (0 if arguments == ["--help"] else 2)
-    status, _, err = run("nonce")
-    assert status == 2 and "nothing is pending" in err
-    status, _, err = run("build", "--board", "nowhere")
-    assert status == 2 and "there is no folder nowhere; --board names a board's folder" in err
     Path("torn").mkdir()
     Path("torn", "board.jsonl").write_text('{"event": "prot')
     status, _, err = run("list", "--board", "torn")
     assert status == 2 and "board.jsonl has only a torn line; restore it from version control" in err
     write("a")
     run("add", "a", "--nonce", "n")
+    assert "nothing is pending" in run("nonce")[2]
     other = incline.Tilt.id
     assert f"there is no board named {other!r}; there are PivotedBar-v0" in run("list", other)[2]
     assert "there is no 'x' on the board" in run("show", "x")[2]
@@ -180,6 +182,36 @@ def test_mistakes(run):
     assert "there is no protocol 3; the current one is 1" in run("show", ids()[0], "--protocol", "3")[2]
     Path("leaderboard/board.jsonl").write_text("<<<<<<< HEAD\n")
     assert "line 1 is not an event" in run("list")[2]
+
+
+@pytest.mark.parametrize(
+    "action",
+    ["add", "nonce", "list", "show x", "withdraw x --reason y", "audit", "pin pin.json", "build", "serve"],
+)
+def test_a_board_that_does_not_exist(run, action):
+    status, out, err = run(*action.split(), "--board", "my typo")
+    assert (status, out) == (2, "")
+    assert "there is no board in my typo; --board names the folder of one, and `lag-envs" in err
+    assert "leaderboard add FOLDER --board 'my typo'` begins one there" in err
+    Path("file").write_text("")
+    assert "file is a file; a board is a folder" in run(*action.split(), "--board", "file")[2]
+    assert os.listdir() == ["file"]
+
+
+def test_a_new_board_is_told(run):
+    assert run("open", "--board", "new")[1].startswith("new is a new board\nprotocol 1;")
+    assert "new board" not in run("open", "--board", "new")[1]
+    assert run("list", "--board", "new")[2].endswith("add FOLDER --board new` adds one\n")
+    assert run("add", write("bad", refuse="why"), "--board", "other")[1] == ""
+    assert not Path("other").exists()
+
+
+def test_columns_of_wide_names(run):
+    write("a", "PPO")
+    write("b", "王 2")
+    run("add", "a", "b", "--nonce", "n")
+    lines = [line for line in run("list")[1].splitlines() if "learned" in line]
+    assert len({columns(line[: line.index("PivotedBar")]) for line in lines}) == 1
 
 
 def test_missing_packages_are_named(run, monkeypatch):
@@ -206,6 +238,8 @@ def test_build(run):
     assert any("An agent" in path.read_text(encoding="utf-8") for path in Path("page").glob("*.html"))
     Path("other").mkdir()
     Path("other/index.html").write_text("mine")
+    Path("my.py").touch()
+    assert "my.py is a file; name a folder for the page" in run("build", "my.py")[2]
     assert "--url: the page's address must begin with https://" in run("build", "--url", "ftp://a")[2]
     status, _, err = run("build", "other")
     assert status == 2 and "other holds other things, such as index.html; name a new or an empty" in err

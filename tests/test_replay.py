@@ -153,6 +153,9 @@ def test_the_command_on_an_environment_of_ones_own(tmp_path, capsys):
     drive = driven(own_files.one(str(file))())
     assert cli.main(["replay", replay.write_link(drive), "--file", str(file)]) == 0
     assert "Push-v0, seed 5, 50 steps" in capsys.readouterr().out
+    other = driven(TASKS[ID]())
+    assert cli.main(["replay", replay.write_link(other), "--file", str(file)]) == 2
+    assert f"the link is for {ID!r}, and {file} has 'Push-v0'" in capsys.readouterr().err
 
 
 # --- the board's best drives --------------------------------------------------------------------------------

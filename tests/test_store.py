@@ -57,6 +57,13 @@ def test_pipes_and_devices_are_written_to_and_stay(tmp_path):
     assert new_file(str(pipe)) == pipe and new_file(os.devnull) == Path(os.devnull)
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs Linux's /proc")
+def test_a_folder_that_takes_no_files_is_noticed_at_once(tmp_path):
+    with pytest.raises(argparse.ArgumentTypeError, match="/proc is not a writable folder"):
+        new_file("/proc/x.json")
+    assert new_file(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b" and os.listdir(tmp_path) == []
+
+
 @pytest.mark.parametrize("name", ["", "long" * 100])
 def test_errors_name_the_file_that_was_asked_for(tmp_path, name):
     for write in (lambda path: store.write_file(path, ""), lambda path: store.append(path, {})):

@@ -153,13 +153,39 @@ def test_every_controller_of_every_environment_can_be_submitted(tmp_path):
 
 
 def test_writing_refuses_and_leaves_nothing(tmp_path):
-    with pytest.raises(Refused, match="0 to 60 characters"):
+    with pytest.raises(Refused, match="1 to 60 characters"):
         linear(tmp_path / "a", name="x" * 61)
     assert os.listdir(tmp_path) == []
     linear(tmp_path / "a")
     with pytest.raises(FileExistsError):
         linear(tmp_path / "a")
     assert os.listdir(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"authors": "Ann"}, r'authors must be a list, such as \["Ann"\], got \'Ann\''),
+        ({"policy": "linear"}, "policy must be a table, such as .* got 'linear'"),
+        ({"arrays": [1]}, "arrays must be a mapping of training seeds .* got a list of 1"),
+        ({"arrays": {0: [1]}}, r"arrays\[0\] must be a mapping of names"),
+        ({"training": "none"}, "training must be a table"),
+        ({"env": incline.Tilt}, "env must be an environment's id"),
+        ({"license": None}, "license must be a text, got None"),
+    ],
+)
+def test_writing_tells_what_is_wanted(tmp_path, given, told):
+    with pytest.raises(Refused, match=told):
+        linear(tmp_path / "a", **given)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("license", "kept"),
+    [("MIT", "MIT"), ("apache-2.0 or mit", "Apache-2.0 OR MIT"), ("LicenseRef-x", "LicenseRef-x")],
+)
+def test_licences_are_those_of_spdx(tmp_path, license, kept):
+    assert linear(tmp_path / "a", license=license).license == kept
 
 
 # --- the page about the format ---

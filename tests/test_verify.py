@@ -363,6 +363,30 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     assert "too far from it: mean returns by" in capsys.readouterr().out
 
 
+def test_command_compares_only_what_can_be_compared(tmp_path, capsys, monkeypatch, submission, result):
+    """Whatever cannot be is told before anything is computed."""
+    from lag_envs.errors import UserError
+
+    monkeypatch.setattr("lag_envs.leaderboard.verify.verify", None)
+    before = tmp_path / "before.json"
+    given = [submission.folder, "--nonce", "nonce", "--episodes", 6, "--against", before]
+
+    def known(**changed):
+        before.write_text(json.dumps([result | changed]))
+
+    known(digest="0" * 64)
+    assert command(*given) == 1
+    assert f"{before} has nothing about it (digest {submission.digest})" in capsys.readouterr().err
+    known()
+    with pytest.raises(UserError, match="with --episodes 6, not 7; only the same episodes"):
+        command(*given, "--episodes", 7)
+    with pytest.raises(UserError, match="with --nonce 'nonce', not 'x'"):
+        command(*given, "--nonce", "x")
+    known(robustness={})
+    with pytest.raises(UserError, match="under other conditions"):
+        command(*given)
+
+
 @pytest.mark.parametrize(
     "content", ["", "{}", "[1]", '[{"digest": 1}]', '[{"digest": "x", "policies": 5}]', "[" * 10**5]
 )

@@ -38,6 +38,8 @@ def new_file(text: str) -> Path:
     argparse.ArgumentTypeError
         If no such file can be written. Missing folders are made when the file is written.
     """
+    import tempfile
+
     path = Path(text)
     if path.is_dir():
         raise argparse.ArgumentTypeError(f"{text} is a folder")
@@ -46,8 +48,14 @@ def new_file(text: str) -> Path:
             raise argparse.ArgumentTypeError(f"{text} cannot be written to")
         return path
     folder = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise argparse.ArgumentTypeError(f"{text} cannot be written: {folder} is not a writable folder")
+    try:
+        # Permissions do not tell all: nobody makes a file in /proc.
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text} cannot be written: {folder} is not a writable folder"
+        ) from error
     with contextlib.suppress(OSError):  # no such file yet, or no output
         if os.path.samestat(path.stat(), os.fstat(1)):
             raise argparse.ArgumentTypeError(f"{text} is the file that this command prints to; name another")

@@ -299,6 +299,8 @@ def run(args: argparse.Namespace) -> int:
         from lag_envs import own_files
 
         task = own_files.made_with_defaults(own_files.one(args.file), args.file)
+        if drive.id != task.id:
+            raise LinkError(f"the link is for {_short(drive.id)}, and {args.file} has {task.id!r}")
     found = replay(drive, task)
     steps = len(drive_keys(drive, task or _task(drive.id)))
     ending = (

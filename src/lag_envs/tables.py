@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 
 
@@ -21,11 +22,24 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     lines: list[list[str]] = [[] for _ in rows]
     for j in range(max(map(len, rows), default=0)):
         cells = [row[j] if j < len(row) else "" for row in rows]
-        width = max(map(len, cells))
+        width = max(map(columns, cells))
         right = all(re.fullmatch(r"(-?[\d.,]+( [kMG])?|-?)", cell) for cell in cells[1:])
         for line, cell in zip(lines, cells, strict=True):
-            line.append(cell.rjust(width) if right else cell.ljust(width))
+            blank = " " * (width - columns(cell))
+            line.append(blank + cell if right else cell + blank)
     return ["  ".join(line).rstrip() for line in lines]
+
+
+def columns(text: str) -> int:
+    r"""Return how many columns of a terminal a text fills; Chinese characters fill two, marks none.
+
+    Examples
+    --------
+    >>> columns("Zoë"), columns("Zoe\u0308"), columns("東京")
+    (3, 3, 4)
+    """
+    marks = sum(unicodedata.category(char) in ("Mn", "Me") for char in text)
+    return len(text) - marks + sum(unicodedata.east_asian_width(char) in "WF" for char in text)
 
 
 def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:

@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import date
 from importlib.util import find_spec
 from pathlib import Path
@@ -66,8 +67,20 @@ def check_checkout(option: str, folder: str) -> None:
 
 def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
     """Declare the option for the date that a result is given."""
-    today = date.today().isoformat()
-    parser.add_argument("--date", default=today, help=f"date to note {where} (default: today)")
+    parser.add_argument(
+        "--date",
+        metavar="YYYY-MM-DD",
+        type=_date,
+        default=date.today().isoformat(),
+        help=f"date to note {where} (default: today)",
+    )
+
+
+def _date(text: str) -> str:
+    with suppress(ValueError):
+        if date.fromisoformat(text).isoformat() == text:
+            return text
+    raise argparse.ArgumentTypeError(f"a date is needed, such as 2026-01-31, got {text!r}")
 
 
 def seconds(text: str) -> float:

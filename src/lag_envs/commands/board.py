@@ -20,8 +20,8 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
     def call(given: Any) -> Any:
         needs(
             "leaderboard",
-            *("confusable_homoglyphs", "jinja2", "pebble", "pydantic", "safetensors", "scipy", "sympy"),
-            *("tomli_w", "tqdm"),
+            *("confusable_homoglyphs", "jinja2", "packaging", "pebble", "pydantic", "safetensors", "scipy"),
+            *("sympy", "tomli_w", "tqdm"),
         )
         from lag_envs.leaderboard.board import BoardError
         from lag_envs.leaderboard.submission import Refused

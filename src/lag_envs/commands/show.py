@@ -71,7 +71,7 @@ def run_watch(args: argparse.Namespace) -> int:
     from gymnasium.error import Error
 
     needs("render", *(["moviepy", "PIL"] if args.video else []), "pygame")
-    needs("leaderboard", "pydantic", "safetensors", "scipy", "sympy", "tomli_w")
+    needs("leaderboard", "packaging", "pydantic", "safetensors", "scipy", "sympy", "tomli_w")
     from lag_envs import watch
 
     id, task = _shown(args)

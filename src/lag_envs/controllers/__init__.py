@@ -83,6 +83,8 @@ def build(task: Any, name: str, *, real_time: bool = False, **numbers: Any) -> A
         Keywords that override those of the task's record.
     """
     found = controllers(task)
+    if not isinstance(name, str):
+        raise TypeError(f"a controller's name is needed, got {name!r}; there are {', '.join(found)}")
     if name not in found:
         raise ValueError(f"{task.id or type(task).__name__} has no controller {name!r}; {hint(name, found)}")
     made = found[name]
@@ -111,7 +113,14 @@ def make_controller(env_id: str, name: str, **env_options: Any) -> Any:
     ------
     ValueError
         For an unknown id or name; it suggests similar ones.
+    TypeError
+        For an id or name that is not a string; `build` takes a task.
     """
+    if not isinstance(env_id, str):
+        raise TypeError(
+            f"an environment's id is needed, such as 'PivotedBar-v0', got {env_id!r}; "
+            "lag_envs.controllers.build takes a task"
+        )
     if env_id not in gym.registry and ":" not in env_id:
         raise ValueError(f"there is no environment {env_id!r}; {hint(env_id, TASKS)}")
     return build(make_task(env_id, **env_options), name)

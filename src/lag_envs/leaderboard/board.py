@@ -21,6 +21,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import shutil
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping
@@ -55,6 +56,10 @@ from lag_envs.tasks import TASKS
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About, Submission
+
+
+#: The folder of the board unless another is named.
+DEFAULT = Path("leaderboard")
 
 
 def closed(env_id: str, number: int, current: int) -> str:
@@ -97,8 +102,34 @@ class Board:
         self.folder = Path(folder)
         self.log = self.folder / LOG
 
+    @property
+    def option(self) -> str:
+        """The option that names the folder to a command, after a space; empty where it is the default."""
+        return "" if self.folder == DEFAULT else f" --board {shlex.quote(str(self.folder))}"
+
+    def exists(self) -> bool:
+        """Return whether the folder holds a board; raise a BoardError if it is a file."""
+        if self.folder.is_file():
+            raise BoardError(f"{self.folder} is a file; a board is a folder")
+        return os.path.lexists(self.log)
+
+    def require(self) -> None:
+        """Raise a BoardError if there is no board."""
+        if not self.exists():
+            raise BoardError(
+                f"there is no board in {self.folder}; --board names the folder of one, and "
+                f"`lag-envs leaderboard add FOLDER{self.option}` begins one there"
+            )
+
     def read(self) -> BoardState:
-        """Return the state that follows from the log; others may be writing to it."""
+        """Return the state that follows from the log; others may be writing to it.
+
+        Raises
+        ------
+        BoardError
+            If there is no board, or its log is damaged.
+        """
+        self.require()
         return fold(parse(read_log(self.log))[0])
 
     def submission(self, id: str) -> Path:
@@ -315,7 +346,16 @@ class Board:
                 append("rejected", id=id, reason=reason[:1000])
 
     def withdraw(self, id: str, reason: str) -> None:
-        """Take a submission off the board, whatever its state; its files stay."""
+        """Take a submission off the board, whatever its state; its files stay.
+
+        Raises
+        ------
+        BoardError
+            If there is no such submission, it was withdrawn before, or the reason is blank: it is logged for
+            good.
+        """
+        if not reason.strip():
+            raise BoardError("a reason is needed, which the page shows for good, such as 'asked for'")
         with self.change() as (state, append):
             if state.entry(id).state == "withdrawn":
                 raise BoardError(f"{id} was withdrawn before")

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.board import DEFAULT, Board
 from lag_envs.leaderboard.log import (
     COMMIT,
     REMEDY,
@@ -64,8 +63,8 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
             "--board",
             metavar="FOLDER",
             type=Path,
-            default=Path("leaderboard"),
-            help="the board's folder (default: leaderboard)",
+            default=DEFAULT,
+            help="the board's folder (default: %(default)s)",
         )
         one.set_defaults(act=run)
         return one
@@ -149,10 +148,17 @@ def run_leaderboard(args: argparse.Namespace) -> int:
         return args.act(args)
     except KeyboardInterrupt:
         if args.action in ("add", "nonce"):
-            board = "" if args.board == Path("leaderboard") else f" --board {shlex.quote(str(args.board))}"
-            again = "the same command" if args.action == "add" else f"`lag-envs leaderboard add{board}`"
+            resume = f"`lag-envs leaderboard add{Board(args.board).option}`"
+            again = "the same command" if args.action == "add" else resume
             print(f"interrupted; what is done is kept, {again} resumes", file=sys.stderr)
         raise
+
+
+def _existing(args: argparse.Namespace) -> Board:
+    """Return the board that is named; raise a BoardError if there is none."""
+    board = Board(args.board)
+    board.require()
+    return board
 
 
 # --- add, nonce ---------------------------------------------------------------------------------------------
@@ -163,6 +169,7 @@ def _add(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.submission import Refused, load
 
     board = Board(args.board)
+    there = board.exists()
     failed, added = 0, []
     for folder in args.folders:
         try:
@@ -174,6 +181,8 @@ def _add(args: argparse.Namespace) -> int:
         added.append(entry.id)
         if entry.state != "pending":
             print(f"{entry.id}: is there already, {entry.state}")
+    if not there and board.exists():
+        print(f"{board.folder} is a new board")
     if args.nonce is not None:
         state = board.read()
         waiting = [e for e in state.waiting() if state.nonce(e) is None]
@@ -210,17 +219,20 @@ def _publish(board: Board, value: str | None, source: str) -> None:
 
 def _open(args: argparse.Namespace) -> int:
     board = Board(args.board)
-    before = board.read()
+    there = board.exists()
+    before = board.read() if there else BoardState()
     number, after = board.open(), board.read()
     waiting = len(after.waiting())
+    if not there:
+        print(f"{board.folder} is a new board")
     if number == before.number and number in before.protocols:
-        there = before.protocols[number].scales
-        print("\n".join(env_id for env_id in after.protocols[number].scales if env_id not in there))
+        old = before.protocols[number].scales
+        print("\n".join(env_id for env_id in after.protocols[number].scales if env_id not in old))
         print(f"joined protocol {number}; what was verified under it stays")
         return 0
     print(f"protocol {number}; to be verified under it: {waiting}")
     if waiting:
-        print("commit and push, then `lag-envs leaderboard nonce`")
+        print(f"commit and push, then `lag-envs leaderboard nonce{board.option}`")
     return 0
 
 
@@ -301,6 +313,8 @@ def _some(board: Board) -> BoardState:
     """Return the board's state; raise a BoardError if nothing is on it."""
     from lag_envs.leaderboard.audit import sound
 
+    if not board.folder.is_dir():
+        board.require()
     try:
         state = board.read()
     except BoardError:
@@ -309,12 +323,9 @@ def _some(board: Board) -> BoardState:
     if not state.entries:
         if parse(read_log(board.log))[1]:
             raise BoardError(f"{board.log} has only a torn line; {REMEDY}")
-        if not board.folder.is_dir():
-            raise BoardError(
-                f"there is no board in {board.folder}; --board names the folder of one, and "
-                "`lag-envs leaderboard add FOLDER` begins one in leaderboard"
-            )
-        raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
+        raise BoardError(
+            f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER{board.option}` adds one"
+        )
     return state
 
 
@@ -387,9 +398,7 @@ def _audit(args: argparse.Namespace) -> int:
 
     from lag_envs.leaderboard.audit import Finding, audit
 
-    board = Board(args.board)
-    if not os.path.lexists(board.log):
-        raise BoardError(f"{board.folder} has no log; there is nothing to audit")
+    board = _existing(args)
     if args.pin and not args.pin.exists():
         raise BoardError(f"--pin: there is no file {args.pin}")
     with tqdm(desc="playing again", unit=" results", disable=None, leave=False, delay=1.0) as bar:
@@ -411,7 +420,7 @@ def _pin(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.audit import PIN, write_pin
 
     file = args.file or PIN
-    pin = write_pin(Board(args.board), file)
+    pin = write_pin(_existing(args), file)
     print(f"{file}: {pin.lines} lines, head {pin.head}")
     return 0
 
@@ -422,11 +431,12 @@ def _pin(args: argparse.Namespace) -> int:
 def _build(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.site.build import safe_url, write_page
 
-    if not args.board.is_dir():
-        raise BoardError(f"there is no folder {args.board}; --board names a board's folder")
+    board = _existing(args)
+    if args.out.is_file():
+        raise BoardError(f"{args.out} is a file; name a folder for the page, and the board with --board")
     if args.url and not safe_url(args.url):
         raise BoardError(f"--url: the page's address must begin with https:// or http://, got {args.url!r}")
-    write_page(page_data(Board(args.board)), args.out, args.url)
+    write_page(page_data(board), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0
 
@@ -438,12 +448,14 @@ def _serve(args: argparse.Namespace) -> int:
 
     from lag_envs.leaderboard.site.build import write_page
 
+    board = _existing(args)
+
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *args: Any) -> None:
             pass
 
     with tempfile.TemporaryDirectory() as folder:
-        write_page(page_data(Board(args.board)), Path(folder))
+        write_page(page_data(board), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except OverflowError as error:

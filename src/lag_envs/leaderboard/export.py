@@ -128,8 +128,6 @@ def _name(source: Source, algo: str | None) -> str:
     """Return what a model's learner is called."""
     if arrays_of(source.model) is None:
         return ALGORITHMS[algo or algorithm_of(source)][1]
-    if algo:
-        raise ExportError(f"{source.model} holds a network, not a model; leave --algo out")
     words = (source.result or {}).get("algo", "ppo").split("_")
     return " ".join(word.upper() if word in ("ppo", "shac") else word for word in words)
 
@@ -167,6 +165,12 @@ def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | No
     table: dict[str, Any] = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
     table |= {"frames": frames} if frames > 1 else {}
     return table | ({} if choices else {"squash": "clip"}), arrays
+
+
+def _only_for_models(option: str, source: Source) -> ExportError:
+    return ExportError(
+        f"--{option} is for models of Stable-Baselines3; {source.model} holds a network, leave it out"
+    )
 
 
 # --- converting ---------------------------------------------------------------------------------------------
@@ -344,6 +348,8 @@ def exported(source: Source, env: str, algo: str | None = None) -> Exported:
     """Return a model of an environment as a submission has it; raise ExportError where it cannot be one."""
     policy = None
     if (ready := arrays_of(source.model)) is not None:
+        if algo:
+            raise _only_for_models("algo", source)
         table, arrays = ready
     else:
         task, (model, normalise) = TASKS[env](), load_model(source, algo or algorithm_of(source))
@@ -502,13 +508,14 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     add("--name", help="as the board shows it (default: the algorithm)")
     add(
         "--normalise", metavar="PKL", nargs="+", type=Path, default=[],
-        help="pickled VecNormalize, one for each MODEL that is a file",
+        help="pickled VecNormalize, one for each MODEL that is a file of Stable-Baselines3",
     )  # fmt: skip
     add(
         "--frames", metavar="N", type=int,
-        help="observations that they see side by side, as with VecFrameStack (default: as recorded, else 1)",
+        help="observations that models of Stable-Baselines3 see side by side, as with VecFrameStack "
+        "(default: as recorded, else 1)",
     )  # fmt: skip
-    add("--algo", choices=list(ALGORITHMS), help="default: detected")
+    add("--algo", choices=list(ALGORITHMS), help="of models of Stable-Baselines3 (default: detected)")
     add("--code", metavar="URL", default="", help="https address of the code it was trained with")
     add("--description", metavar="TEXT", default="", help="a line about it")
     add("--env-steps", metavar="N", type=int, help="steps of one training (default: as recorded)")
@@ -523,6 +530,11 @@ def run_export(args: argparse.Namespace) -> int:
 
         torch.set_num_threads(1)  # such networks are too small to share out
         sources = find(args.models, args.normalise)
+        for option in ("algo", "frames", "normalise"):
+            if getattr(args, option):
+                for source in sources:
+                    if arrays_of(source.model) is not None:
+                        raise _only_for_models(option, source)
         if args.frames is not None:
             sources = [replace(source, frames=args.frames) for source in sources]
         known = args.env or _same("environment", [(s.result or {}).get("env") for s in sources], "--env")

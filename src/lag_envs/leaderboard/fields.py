@@ -24,7 +24,7 @@ def line(longest: int, least: int = 0) -> AfterValidator:
 
     def check(text: str) -> str:
         if not least <= len(text) <= longest:
-            raise ValueError(f"must have {least} to {longest} characters")
+            raise ValueError(f"must have {f'{least} to' if least else 'at most'} {longest} characters")
         if reason := unreadable(text):
             raise ValueError(reason)
         return text

@@ -201,5 +201,5 @@ class Neighbours:
 def _outcome(board: Board, entry: BoardEntry) -> str:
     now = board.read().entry(entry.id)
     if now.state == "pending":
-        return "pending, until a nonce is published: `lag-envs leaderboard nonce`"
+        return f"pending, until a nonce is published: `lag-envs leaderboard nonce{board.option}`"
     return f"{now.state}: {now.reason}" if now.reason else now.state

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Self
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +55,10 @@ class About:
 
     Parameters
     ----------
-    env, name, license : str
+    env, name : str
         As in the file.
+    license : str
+        The SPDX expression, with SPDX's capitals.
     kind : str
         "learned", "controller" or "optimal"; follows from the architecture.
     authors : tuple of str
@@ -116,6 +119,31 @@ def _named(name: str) -> str:
     return name
 
 
+def _in_ids(name: str) -> str:
+    if not re.search("[A-Za-z0-9]", name):  # ids on the board are made of these
+        raise ValueError("there must be a letter from A to Z or a digit from 0 to 9")
+    return name
+
+
+def _licence(text: str) -> str:
+    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+
+    try:
+        return canonicalize_license_expression(text)
+    except InvalidLicenseExpression:
+        raise ValueError(
+            "an SPDX expression is needed, such as MIT, CC-BY-4.0 or Apache-2.0 OR MIT; "
+            "LicenseRef-NAME stands for any other licence"
+        ) from None
+
+
+def _address(code: str) -> str:
+    # https://github.com@evil.org leads to evil.org.
+    if "@" in urlsplit(code).netloc:
+        raise ValueError("there must be no @ before the first / of the path: it would hide where this leads")
+    return code
+
+
 def _on_a_board(env: str) -> str:
     if env not in (known := protocol.boards()):
         raise ValueError(f"there is no such board; {hint(env, known, 'lag-envs list names them')}")
@@ -153,10 +181,15 @@ class Toml(Strict):
     #: Decided by the board: earlier exports may state it, and it is ignored.
     stated: Annotated[int, between(1, 10**6)] = Field(default=1, alias="protocol")
     env: Annotated[str, AfterValidator(_on_a_board)]
-    name: Annotated[str, line(60), Field(pattern="[A-Za-z0-9]")]
-    authors: Annotated[list[Annotated[str, line(80), AfterValidator(_named)]], length_between(1, 20)]
-    license: Annotated[str, line(60), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+() -]*$")]
-    code: Annotated[str, line(200), Field(pattern=r"^(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?$")] = ""
+    name: Annotated[str, line(60, least=1), AfterValidator(_in_ids)]
+    authors: Annotated[list[Annotated[str, line(80, least=1), AfterValidator(_named)]], length_between(1, 20)]
+    license: Annotated[str, line(60), AfterValidator(_licence)]
+    code: Annotated[
+        str,
+        line(200),
+        Field(pattern=r"^(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?$"),
+        AfterValidator(_address),
+    ] = ""
     description: Annotated[str, line(500)] = ""
     #: Follows from the architecture; may be stated too.
     kind: Any = None
@@ -390,8 +423,10 @@ def _check_header(content: bytes) -> None:
         return dict(pairs)
 
     size = int.from_bytes(content[:8], "little")
-    if size > protocol.HEADER_BYTES:
+    if len(content) >= 8 and size > protocol.HEADER_BYTES:
         raise ValueError(f"its header must have at most {protocol.HEADER_BYTES} bytes, not {size}")
+    if len(content) < 8 + size:
+        raise ValueError(f"it is cut off after {len(content)} bytes")
     try:
         header = json.loads(content[8 : 8 + size].decode(), object_pairs_hook=once)
     except (ValueError, RecursionError) as error:
@@ -474,7 +509,13 @@ def write(
     import tomli_w
     from safetensors.numpy import save
 
-    folder, arrays = Path(folder), arrays or {}
+    folder, arrays = Path(folder), {} if arrays is None else arrays
+    _check_kinds(env, authors, policy, arrays, training or {})
+    for what, text in (
+        ("name", name), ("license", license), ("kind", kind), ("code", code), ("description", description),
+    ):  # fmt: skip
+        if not isinstance(text, str):
+            raise Refused(f"{what} must be a text, got {shown_ascii(text)}")
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} already exists")
     # The oldest version that has such policies, so that a policy's files never change.
@@ -502,3 +543,20 @@ def write(
         shutil.rmtree(part, ignore_errors=True)
         raise
     return load(folder)
+
+
+def _check_kinds(env: Any, authors: Any, policy: Any, arrays: Any, training: Any) -> None:
+    """Refuse what is of another kind than `write` documents; a string would pass for a list of letters."""
+    names = [authors] if isinstance(authors, str) else ["A. Author"]
+    for what, given, kind, wanted in (
+        ("env", env, str, "an environment's id, such as 'PivotedBar-v0'"),
+        ("authors", authors, list | tuple, f"a list, such as {json.dumps(names)}"),
+        ("policy", policy, Mapping, "a table, such as {'architecture': 'linear'}"),
+        ("arrays", arrays, Mapping, "a mapping of training seeds to arrays by name"),
+        ("training", training, Mapping, "a table, such as {'env_steps': 500000, ...}"),
+    ):
+        if not isinstance(given, kind):
+            raise Refused(f"{what} must be {wanted}, got {shown_ascii(given)}")
+    for seed, content in arrays.items():
+        if not isinstance(content, Mapping):
+            raise Refused(f"arrays[{seed}] must be a mapping of names to arrays, got {shown_ascii(content)}")

@@ -28,7 +28,7 @@ from lag_envs.leaderboard.fields import ascii_text
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import load_json
 from lag_envs.leaderboard.results import UNPACKED, checked_result, code_digest, compare_results
-from lag_envs.leaderboard.submission import Refused, Submission, load
+from lag_envs.leaderboard.submission import Refused, Submission, about, load, read_files
 from lag_envs.options import new_file
 from lag_envs.store import write_file
 from lag_envs.tasks import TASKS
@@ -243,18 +243,21 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=new_file, metavar="FILE", help="write all results to this file")
     parser.add_argument(
         "--against", metavar="FILE",
-        help="compare with results that --json wrote, here or elsewhere, for the same nonce and episodes",
+        help="compare with results that --json wrote, here or elsewhere, for the same submissions, nonce and "
+        "episodes; the exit status is 1 if they differ too much",
     )  # fmt: skip
 
 
 def run_verify(args: argparse.Namespace) -> int:
-    """Verify submissions and print their results; return 1 if one was refused."""
+    """Verify submissions and print their results; return 1 if one was refused, or is not as before."""
     if not 1 <= args.episodes <= 100_000:
         raise UserError(f"--episodes must lie between 1 and 100000, got {args.episodes}")
     if args.jobs < 1:
         raise UserError(f"--jobs must be at least 1, got {args.jobs}")
     folders = [Path(folder) for folder in args.folders]
     before = _read(Path(args.against)) if args.against else None
+    if before is not None and not _comparable(folders, before, args):
+        return 1
     results: list[dict[str, Any]] = []
     far = False
     try:
@@ -292,13 +295,46 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
         raise UserError(f"--against: {file} cannot be read: {what}") from error
 
 
+def _comparable(folders: list[Path], before: dict[str, dict[str, Any]], args: argparse.Namespace) -> bool:
+    """Return whether there are earlier results of all submissions; print which have none.
+
+    Raises
+    ------
+    UserError
+        If one is of other episodes, or was measured under other conditions.
+    """
+    missing = 0
+    for folder in folders:
+        try:
+            told = about(read_files(folder))
+        except Refused:
+            continue  # verifying it tells why
+        name, other = ascii_text(folder), before.get(told.digest)
+        if other is None:
+            missing += 1
+            print(f"{name}: {args.against} has nothing about it (digest {told.digest})", file=sys.stderr)
+            continue
+        for option in ("nonce", "episodes"):
+            here, there = getattr(args, option), other[option]
+            if here != there:
+                raise UserError(
+                    f"--against: {args.against} has {name} with --{option} {there!r}, not {here!r}; "
+                    "only the same episodes can be compared"
+                )
+        if set(other["robustness"]) != {condition.name for condition in on_board(told.env)}:
+            raise UserError(
+                f"--against: {args.against} has {name} under other conditions, by another version of lag_envs"
+            )
+    return not missing
+
+
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, plans: bool) -> bool:
     """Print how a result compares with an earlier one; return whether it is too far from it."""
     from lag_envs.scores import known_returns
 
     if other is None:
         print(f"  {file} has nothing about it")
-        return False
+        return True
     known = known_returns(result["env"])
     assert known is not None
     try:
