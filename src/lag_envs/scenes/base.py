@@ -478,7 +478,7 @@ class Scene(metaclass=SceneType):
     ) -> tuple[Array, ...]:
         """Return the derivatives of the state after a control step with respect to state and controls.
 
-        The derivatives use the same series and substeps as the step itself.
+        The derivatives come from the step's own series. Where they need shorter substeps, they take them.
 
         Parameters
         ----------
@@ -504,8 +504,8 @@ class Scene(metaclass=SceneType):
         Raises
         ------
         ValueError, StepRefused
-            As `simulate` does; ValueError also for a parameter that the scene lacks, or that the motion is
-            not differentiable in, as may happen at 0.
+            As `simulate` does; StepRefused also if only the derivatives cannot be found, ValueError also for
+            a parameter that the scene lacks, or that the motion is not differentiable in, as may happen at 0.
 
         Examples
         --------

@@ -246,8 +246,15 @@ def _check_refused(
 ) -> None:
     if refused:
         i = refused - 1
-        where = f"the step of row {i if rows is None else rows[i]}"
-        raise refusal(scene, states[i], controls[i], dt, None, where)
+        row, held = i if rows is None else rows[i], controls[i][None] if scene.control_names else 1
+        try:
+            scene.simulate(states[i], held, dt)
+        except StepRefused:
+            raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {row}") from None
+        raise StepRefused(
+            f"the step of row {row} can be taken, but its derivatives cannot be found: they need more than "
+            "the largest number of substeps, or are not finite; take a smaller dt"
+        )
 
 
 class _Derivatives(NamedTuple):
