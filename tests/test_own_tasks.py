@@ -401,6 +401,10 @@ def _mistaken(**changes):
             {"reward": lambda self, *_: np.random.default_rng().random()},
             "another result when it is run again",
         ),
+        (
+            {"reward": lambda self, b, after, *_: after.x - self.__dict__.setdefault("last", after.x)},
+            "reward: it assigns to self.last, .* `before` in a reward",
+        ),
         ({"terminated": lambda self, after, target, xp: after.x}, "returns a number; it must return a truth"),
         ({"terminated": lambda self, after, target, xp: None}, "returns None; it must return a truth value"),
         ({"terminated": lambda self, after, target, xp: after.x & (after.x > 0)}, "take comparisons"),

@@ -124,10 +124,11 @@ def test_missing_display_is_named(monkeypatch):
 def test_a_window_that_nobody_sees_is_not_opened(monkeypatch):
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     monkeypatch.setattr(pygame.display, "init", lambda: None)
-    monkeypatch.setattr(pygame.display, "set_mode", lambda size: None)
     monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
     with pytest.raises(gym.error.Error, match="no display here; `lag-envs watch ID --video FILE`"):
-        screen._open_window(10, 10)
+        screen.check_display()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    screen.check_display()
 
 
 def test_missing_pygame_is_named_with_its_remedy(monkeypatch):

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from lag_envs.envs.screen import check_display
 from lag_envs.scenes import StepRefused
 from lag_envs.scores import in_words
 
@@ -145,6 +146,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None, **option
     import pygame
 
     env = gym.make(id, render_mode="human", **options)
+    check_display()
     own: Any = env.unwrapped
     rest = resting(own.task)
     print("\n".join(help_of(own.task, env.action_space)), flush=True)

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.envs.screen import check_display
 from lag_envs.errors import UserError, hint
 from lag_envs.leaderboard.shipped import shipped
 from lag_envs.scores import in_words
@@ -191,6 +192,8 @@ def watch(
         Keywords of the environment.
     """
     env = gym.make(env_id, render_mode="human" if video is None else "rgb_array", **options)
+    if video is None:
+        check_display()
     most = 1 if video is not None and episodes is None else episodes
     returns: list[float] = []
     try:

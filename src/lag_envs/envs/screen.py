@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import weakref
@@ -99,12 +100,19 @@ def _open_window(width: int, height: int) -> pygame.Surface:
         screen = pygame.display.set_mode((width, height))
     except pygame.error as error:
         raise Error(f"no window can be opened ({error}); {REMEDY}") from error
-    # Where there is no display, SDL opens a window that nobody sees.
-    if pygame.display.get_driver() in ("offscreen", "dummy") and not os.environ.get("SDL_VIDEODRIVER"):
-        pygame.display.quit()
-        raise Error(f"there is no display here; {REMEDY}")
     pygame.display.set_caption("lag_envs")
     return screen
+
+
+def check_display() -> None:
+    """Raise an error where SDL would open a window that nobody sees, unless its user asks for that."""
+    pygame = load_pygame()
+    with contextlib.suppress(pygame.error):  # whoever opens a window is told why there is none
+        pygame.display.init()
+        unseen = pygame.display.get_driver() in ("offscreen", "dummy")
+        if unseen and not os.environ.get("SDL_VIDEODRIVER"):
+            pygame.display.quit()
+            raise Error(f"there is no display here; {REMEDY}")
 
 
 desk = Desk()

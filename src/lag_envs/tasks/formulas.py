@@ -11,6 +11,7 @@ import math
 import numbers
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -262,8 +263,10 @@ class TaskFormulas:
 
     def _call(self, name: str, k: Any, *arguments: Any) -> Any:
         with formula(self._task, name):
+            task = self.with_numbers(k)
+            before = dict(vars(task))
             try:
-                return getattr(self.with_numbers(k), name)(*arguments)
+                result = getattr(task, name)(*arguments)
             except AttributeError as error:
                 if not isinstance(error.obj, ElementaryTrace):
                     raise
@@ -271,6 +274,14 @@ class TaskFormulas:
                     f"it uses xp.{error.name}; a task's formula has xp.sin, cos, tan, atan, tanh, sqrt, exp, "
                     "log, where, abs, minimum, maximum, floor and pi"
                 ) from error
+            for key, value in vars(task).items():
+                kept = isinstance(getattr(type(task), key, None), cached_property)
+                if not kept and (key not in before or before[key] is not value):
+                    raise FormulaError(
+                        f"it assigns to self.{key}, but it is run once and compiled; use its arguments, such "
+                        "as `before` in a reward, or entries of the state"
+                    )
+            return result
 
     def action(self, control: Any) -> Any:
         """Return the unclipped action that requests a control; for tasks with one control."""
