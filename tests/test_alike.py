@@ -25,7 +25,7 @@ from lag_envs.leaderboard.board import Board, others
 from lag_envs.leaderboard.pending import Neighbours
 from lag_envs.leaderboard.ranking import policy_error
 from lag_envs.leaderboard.submission import Refused, load, write
-from lag_envs.tasks import cylinder_in_cylinder, incline
+from lag_envs.tasks import incline
 
 ROOT = Path(__file__).parents[1]
 BOARD = Board(ROOT / "leaderboard")
@@ -141,7 +141,7 @@ def error_of(id):
     return policy_error(reference, BOARD.result(entry)["policies"])
 
 
-QUICK = (f"{incline.Brake.id}-ppo", f"{cylinder_in_cylinder.Pump.id}-td3")
+QUICK = f"{incline.Brake.id}-ppo"
 
 
 @pytest.mark.parametrize(

@@ -429,6 +429,7 @@ def test_what_is_new_needs_the_new_schema(env, policy, tmp_path):
             load(tmp_path / "a")
 
 
+@pytest.mark.slow
 def test_what_is_old_stays_what_it_is(tmp_path):
     """Everything on the board still has its digest; of schema 2 is only what needs it."""
     entries = BOARD.read().entries.values()

@@ -75,6 +75,7 @@ def test_marks_are_exact_times():
         assert Fraction(float(n) * dt) == n * Fraction(dt)
 
 
+@pytest.mark.slow
 def test_a_broken_balance_is_seen(runs):
     (row,) = [r for r in runs if r["kind"] == "balance"]
     assert row["largest"] < 1e-13 * row["energy"]

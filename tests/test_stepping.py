@@ -583,7 +583,7 @@ class Motor(Scene):
 
 @pytest.mark.parametrize(
     ("name", "gravity"),
-    every(8, product(("tanh", "sin", "cos", "tan", "exp", "log", "sqrt", "atan"), (9.81, 0.0))),
+    every(16, product(("tanh", "sin", "cos", "tan", "exp", "log", "sqrt", "atan"), (9.81, 0.0))),
 )
 def test_functions_of_a_control(name, gravity):
     """As the held value itself; in a flow of its own, or in the general series, which has all functions."""

@@ -48,7 +48,8 @@ class Task:
     of the step, with the names of ``scene.state_names``; ``control`` has the applied controls, ``target`` the
     targets. Formulas may use ``+ - * /``, integer powers, comparisons joined by ``|`` and ``&``, functions
     of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum), and the scene's
-    parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
+    parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)`` and
+    ``self.scene.kinetic(after, after.v, xp)``, where ``after.v`` has the velocities by coordinate.
 
     Attributes
     ----------
