@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import own_tasks
 import pytest
-from covering import covering, engine, every, slow, way
+from covering import covering, engine, slow, way
 from test_jacobian import exact_step
 
 from lag_envs.envs.model import Model
@@ -49,7 +49,7 @@ def check_directions(scene, state, control, dt, directions):
             assert (np.abs(found @ direction - expected) <= 1e-10 * size).all(), direction
 
 
-@pytest.mark.parametrize("env_id", every(2, covering(of=way)))
+@pytest.mark.parametrize("env_id", covering(of=way))
 def test_jacobian_by_all_parameters(env_id):
     """Along a random direction, so that two exact steps are enough; over the task's own control interval."""
     task, rng = TASKS[env_id](), seeded(env_id)
@@ -123,7 +123,7 @@ def test_what_has_no_derivative():
     assert a.shape == (2, 2) and np.isfinite(p).all()
 
 
-@pytest.mark.parametrize("env_id", every(2, covering(of=engine)))
+@pytest.mark.parametrize("env_id", covering(of=engine))
 def test_vjp_is_the_jacobian_transposed(env_id):
     """At rest, at moderate and at high speeds, where the step is divided."""
     scene, rng = TASKS[env_id]().scene, seeded(env_id)
