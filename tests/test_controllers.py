@@ -192,7 +192,7 @@ def test_hysteresis_is_kept_outside():
 # --- linearisation ---
 
 RESTING = [env_id for env_id, task in TASKS.items() if task.examples.rest]
-QUICK = (BAR, INCLINE)
+QUICK = (BAR,)
 
 
 @pytest.mark.parametrize("env_id", [*QUICK, *(slow(env_id) for env_id in RESTING if env_id not in QUICK)])

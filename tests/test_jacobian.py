@@ -130,7 +130,7 @@ HEAVY = {
 
 #: Those that take seconds to compile or in exact arithmetic.
 LONG = (
-    "support at rest", "support driven", "shell turns", "shell turns without gravity",
+    "support at rest", "support driven", "no field", "shell turns", "shell turns without gravity",
     "the control is the drag",
 )  # fmt: skip
 
