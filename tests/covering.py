@@ -29,6 +29,7 @@ WORDS_AND_NUMBERS = frozenset(
 Features = Callable[[type[Task]], frozenset[str]]
 #: Environments without hidden parameters, imperfect sensors or actuators.
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
+IMPERFECT = [env_id for env_id in TASKS if env_id not in PERFECT]
 
 
 def slow(*values: Any) -> Any:

@@ -22,6 +22,7 @@ from agents.report import agents_page
 from lag_envs import TASKS, cli, register
 from lag_envs.controllers import controllers, make_controller
 from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.evaluation import conditions
 from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
@@ -160,7 +161,10 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     assert found["there after [s]"] < 1.5 and found["episodes without"] < 10
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.
+    # Each kind of imperfection has a program of its own: two do here.
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 2)
+    some = conditions.imperfections(ID)[::4]
+    monkeypatch.setattr(conditions, "imperfections", lambda env_id: some)
     learned = submit.submit_learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
     assert learned.code.endswith("/agents/ppo.py")
     for name in controllers(task):

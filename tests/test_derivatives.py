@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import own_tasks
 import pytest
-from covering import covering, engine, slow, way
+from covering import covering, slow, way
 from test_jacobian import exact_step
 
 from lag_envs.envs.model import Model
@@ -123,7 +123,7 @@ def test_what_has_no_derivative():
     assert a.shape == (2, 2) and np.isfinite(p).all()
 
 
-@pytest.mark.parametrize("env_id", covering(of=engine))
+@pytest.mark.parametrize("env_id", covering(of=way))
 def test_vjp_is_the_jacobian_transposed(env_id):
     """At rest, at moderate and at high speeds, where the step is divided."""
     scene, rng = TASKS[env_id]().scene, seeded(env_id)

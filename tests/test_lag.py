@@ -550,7 +550,8 @@ def test_environment_without_actions_cannot_lag():
         own_tasks.Drift(lag=0.1)
 
 
-@pytest.mark.parametrize(("more", "command"), [({}, 5), slow({"action_delay": 0.01}, 0)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("more", "command"), [({}, 5), ({"action_delay": 0.01}, 0)])
 def test_refused_step_leaves_the_environments_as_they_were(more, command):
     keywords = {"lag": 0.05, "damping": 1e6, "max_episode_steps": 500} | more
     env, envs = gym.make("PivotedBar-v0", **keywords), gym.make_vec("PivotedBar-v0", num_envs=2, **keywords)

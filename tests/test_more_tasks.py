@@ -266,6 +266,7 @@ def test_renewed_plans_are_the_same_alone_and_after_a_restart():
     assert memory.step.tolist() == [6, 3]
 
 
+@pytest.mark.slow
 def test_a_value_that_overflows_loses_no_plan(monkeypatch):
     task = make_task(PendubotReal.id)
     agent = build(task, "MPC")

@@ -10,7 +10,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering, engine, features, quick, slow, way
+from covering import IMPERFECT, PERFECT, covering, engine, features, quick, slow, way
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -164,7 +164,7 @@ def test_same_bits_where_parameters_differ(env_id, mode):
         ).all()
 
 
-@pytest.mark.parametrize("env_id", covering(of=engine))
+@pytest.mark.parametrize("env_id", [*covering(PERFECT, engine), *map(slow, IMPERFECT)])
 def test_same_bits_with_a_coarse_step(env_id):
     dt = min(10.0 * TASKS[env_id].interval, 0.2)  # more than one substep here and there
     native, sync = pair(env_id, 7, dt=dt, **lasting(env_id, 200))
