@@ -342,8 +342,18 @@ def _method(data: Data) -> str:
             " earlier, and the 20 episodes may be lucky. Seconds are processor time of training"
             " alone, on one core (wall time for policies from before November 2026)."
             " `python -m agents.race` tests more often, one run at a time.",
+            *_together(data),
         ]
     )
+
+
+def _together(data: Data) -> list[str]:
+    """Return how long all runs of learners took."""
+    agents = [agent for env in data["envs"].values() for agent in env["agents"].values()]
+    learned = [agent for agent in agents if agent["kind"] == "learned"]
+    runs = sum(len(agent["seeds"]) for agent in learned)
+    hours = sum(agent["seconds"] * len(agent["seeds"]) for agent in learned) / 3600.0
+    return [f"- All {runs:,} runs of learners took {hours:,.1f} hours of training."] if learned else []
 
 
 def _fewer(data: Data) -> list[str]:
