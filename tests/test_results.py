@@ -343,6 +343,13 @@ def test_fewer_episodes_where_something_is_changed(tmp_path):
     assert counts(1000, 50) == ({(True, 1000), (False, 50)},) * 2
 
 
+def test_hours_of_all_trainings():
+    agents = {"ppo": {"kind": "learned", "seeds": [0, 1], "seconds": 4500.0}, "zero": {"kind": "classical"}}
+    (line,) = report._together({"envs": {"A": {"agents": agents}, "B": {"agents": agents}}})
+    assert line == "- All 4 runs of learners took 5.0 hours of training."
+    assert report._together({"envs": {}}) == []
+
+
 def test_fewer_episodes_are_told():
     def agent(nominal, late):
         return {"conditions": {NOMINAL: {"episodes": nominal}, "late": {"episodes": late}}}
