@@ -93,7 +93,7 @@ UNTRACEABLE = {
     ),
     "equal": (
         {"potential": lambda self, q, xp: q.x**2 if self.spring == 0.0 else 0.0},
-        "potential; comparison; branch",
+        "potential; comparison; branch on a field that is no parameter",
     ),
     "is in": (
         {"potential": lambda self, q, xp: q.x**2 if self.spring in (0.0, 1.0) else 0.0},
@@ -103,7 +103,10 @@ UNTRACEABLE = {
         {"potential": lambda self, q, xp: q.x**2 if self.spring in q else 0.0},
         "potential; `in`",
     ),
-    "truth": ({"potential": lambda self, q, xp: q.x**2 if self.friction else 0.0}, "potential; `if`; branch"),
+    "truth": (
+        {"potential": lambda self, q, xp: q.x**2 if self.friction else 0.0},
+        "potential; `if`; branch on a field that is no parameter",
+    ),
     "logic": ({"potential": lambda self, q, xp: self.friction or q.x**2}, "potential; `if`"),
     "where": ({"potential": lambda self, q, xp: xp.where(True, q.x, 0.0)}, "potential; xp.where; smooth"),
     "absolute value": (
@@ -182,6 +185,14 @@ def assignment_to_self():
         return self.spring * q.x**2
 
     return changed(potential=formula)
+
+
+@mistake("cannot assign to field 'mass'", "__init__", "mass: float = parameter")
+def numbers_set_by_an_init():
+    def init(self, mass=1.0):
+        self.mass = mass
+
+    return changed(__init__=init)
 
 
 @mistake("potential", "sets", "read")

@@ -25,6 +25,8 @@ Monomial = tuple[tuple["Atom", int], ...]
 
 #: A product of two sums that would have more terms than this stays a product.
 LARGEST_PRODUCT = 4096
+#: What branches are for.
+BRANCH = "where the form differs, branch on a field that is no parameter, such as `spring: bool = True`"
 
 
 class FormulaError(TypeError, ValueError):
@@ -286,10 +288,11 @@ class Expr:
         self._refuse("complex()", "formulas are real")
 
     def __bool__(self) -> bool:
-        self._refuse("`if`, `and`, `or`, `not` or `in`", "a formula cannot branch on its numbers")
+        self._refuse("`if`, `and`, `or`, `not` or `in`", f"a formula cannot branch on its numbers; {BRANCH}")
 
     def _compare(self, other: Any) -> NoReturn:
-        self._refuse("a comparison, min or max", "an energy must be smooth and cannot branch on its numbers")
+        remedy = f"an energy must be smooth and cannot branch on its numbers; {BRANCH}"
+        self._refuse("a comparison, min or max", remedy)
 
     __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
 

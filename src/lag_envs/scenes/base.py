@@ -62,6 +62,11 @@ class SceneType(ABCMeta):
             if not unknown:
                 raise
             raise TypeError(f"{error}; {hint(unknown[0], fields)}") from None
+        except dataclasses.FrozenInstanceError as error:
+            raise FormulaError(
+                f"{cls.__name__}: {error}, scenes never change; instead of an __init__ of its own the class "
+                "declares its numbers, as in `mass: float = parameter(1.0, 'kg')`"
+            ) from error
         admit(scene, Scene)
         return scene
 
