@@ -45,6 +45,10 @@ class DualTarget:
         self._t, self._wide, self._broadcast, self._tangents = target, wide, broadcast, tangents
         self.group = wide.group
 
+    def __getattr__(self, name: str) -> Any:
+        """Leave indices and conditions to the target of values."""
+        return getattr(self._t, name)
+
     def number(self, value: float) -> DualNumber:
         return DualNumber(self._t.number(value))
 
@@ -96,26 +100,11 @@ class DualTarget:
     def less(self, a: DualNumber, b: DualNumber) -> Any:
         return self._t.less(a.value, b.value)
 
-    def both(self, a: Any, b: Any) -> Any:
-        return self._t.both(a, b)
-
     def real(self, k: Any) -> DualNumber:
         return DualNumber(self._t.real(k))
 
     def reciprocal(self, k: Any) -> DualNumber:
         return DualNumber(self._t.reciprocal(k))
-
-    def index(self, k: int) -> Any:
-        return self._t.index(k)
-
-    def half(self, k: Any) -> Any:
-        return self._t.half(k)
-
-    def plus(self, k: Any, n: int) -> Any:
-        return self._t.plus(k, n)
-
-    def minus(self, a: Any, b: Any) -> Any:
-        return self._t.minus(a, b)
 
     def _slopes(self, number: DualNumber) -> Any:
         return self._wide.number(0.0) if number.slopes is None else number.slopes
