@@ -187,7 +187,7 @@ def assignment_to_self():
     return changed(potential=formula)
 
 
-@mistake("cannot assign to field 'mass'", "__init__", "mass: float = parameter")
+@mistake("cannot assign to field 'mass'", "declares", "mass: float = parameter")
 def numbers_set_by_an_init():
     def init(self, mass=1.0):
         self.mass = mass
