@@ -64,8 +64,9 @@ class SceneType(ABCMeta):
             raise TypeError(f"{error}; {hint(unknown[0], fields)}") from None
         except dataclasses.FrozenInstanceError as error:
             raise FormulaError(
-                f"{cls.__name__}: {error}, scenes never change; a class declares its numbers instead of setting "
-                "them, as in `mass: float = parameter(1.0, 'kg')`, or with a function of the scene for 1.0"
+                f"{cls.__name__}: {error}, scenes never change; a class declares its numbers instead of "
+                "setting them, as in `mass: float = parameter(1.0, 'kg')`; a function of the scene in place "
+                "of 1.0 computes what follows from others"
             ) from error
         admit(scene, Scene)
         return scene
