@@ -157,6 +157,7 @@ def test_gyroscopes_on_two_bars(seed):
     assert agrees(found, truth) and found.warnings == ()
 
 
+@pytest.mark.slow
 def test_a_start_where_the_model_is_singular_is_not_chosen():
     truth = Bob(drag=0.2)
     data = truth.simulate([2.0, 0.0, 0.0, 2.0], 99, 0.02)
@@ -317,6 +318,7 @@ def test_hardly_determined():
     assert unbounded == math.inf  # silently: the end of an interval
 
 
+@pytest.mark.slow
 def test_at_rest():
     """Nothing moves, so nothing is learnt; sin(π) is rounding, and no signal."""
     still = np.tile([math.pi, 0.0], (100, 1))

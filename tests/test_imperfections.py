@@ -77,7 +77,8 @@ def played(env_id: str, n: int, steps: int, mode: str = "NextStep", **keywords):
     return np.array(seen), envs
 
 
-@pytest.mark.parametrize("mode", ["NextStep", slow("SameStep")])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_all_together_single_and_vector(mode):
     seen, envs = played(ID, 3, 70, mode, duration=0.5, **ALL)
     assert len(np.unique(seen[:, :, 2])) > 50 and set(envs.unwrapped.parameters) == set(ALL["randomize"])

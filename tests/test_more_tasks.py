@@ -303,6 +303,7 @@ def test_dry_friction_has_its_slope(state, torque):
     np.testing.assert_allclose(by_state, slopes, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_between_the_steps_of_a_plan_feedback_acts_on_the_line_between_its_states():
     task = make_task(PendubotReal.id)
     agent, read = build(task, "MPC", every=3), ObservationDecoder(task)

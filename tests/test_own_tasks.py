@@ -200,7 +200,7 @@ def test_bad_actions(action):
 @pytest.mark.parametrize(
     ("wild", "why"),
     [
-        (
+        slow(
             [0, 0, 0, 0, 0.3, 1],
             "the mass matrix of x, rope, swing is not positive definite there; choose other",
         ),
