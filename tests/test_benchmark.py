@@ -317,7 +317,7 @@ def test_the_whole_command_measures_in_a_process_of_its_own(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     report = json.loads(output.read_text())
     assert report["complete"]
-    assert report["date"] == "today"
+    assert report["date"] == "2026-01-31"
     assert str(output) in done.stdout
 
 
