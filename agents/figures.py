@@ -184,11 +184,11 @@ def improvement_figure(envs: Mapping[str, Data]) -> Any:
         values = np.array(
             [[r.get(c, {}).get("value", math.nan) for c in names] for r in env["improvement"].values()]
         )
-        _heat(ax, values, 0.0, 1.0, "{:.2f}".format)
+        _heat(ax, values, 0.0, 1.0, lambda p: f"{p:.2f}" if 0.0 < p < 1.0 else "")
         angle: Any = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
         ax.set_xticks(range(len(names)), names.values(), fontsize=7, **angle)
         ax.set_yticks(range(len(rows)), rows, fontsize=8)
-    figure.supylabel("probability that a run of this ...", fontsize=9)
+    figure.supylabel("probability (dark: 0, bright: 1) that a run of this ...", fontsize=9)
     figure.supxlabel("... is better than this", fontsize=9)
     return figure
 

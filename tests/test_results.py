@@ -288,7 +288,7 @@ def test_page_and_figures_of_any_results(tmp_path):
     drawn = {file.name for file in (tmp_path / results.PICTURES).iterdir()}
     assert {file for file in linked if not file.startswith("value-")} == drawn
     for file in (tmp_path / results.PICTURES).iterdir():
-        assert file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size < 130_000
+        assert file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size < 125_000
 
 
 def a_rounding_away(observation):
@@ -434,4 +434,4 @@ def test_committed_page_is_made_from_the_committed_results():
     for line in text.splitlines():
         if "](images/" in line:
             file = ROOT / "docs" / line.split("](")[1].rstrip(")")
-            assert file.stat().st_size < 130_000
+            assert file.stat().st_size < 125_000

@@ -25,7 +25,7 @@ Monomial = tuple[tuple["Atom", int], ...]
 
 #: A product of two sums that would have more terms than this stays a product.
 LARGEST_PRODUCT = 4096
-#: What branches are for.
+#: The remedy for a branch on a number.
 BRANCH = "where the form differs, branch on a field that is no parameter, such as `spring: bool = True`"
 
 
