@@ -12,7 +12,6 @@ have the derivative 0. A branch that was not taken contributes exactly 0, whatev
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
@@ -27,25 +26,22 @@ from lag_envs.stepping.tracing import BOOLEAN, Operation, Trace, TracedNumber
 LANES = 64
 
 
-def _whole(name: str) -> Callable:
-    function = getattr(math, name)
-
-    def of(self: Differentiable, a: Any) -> Any:
-        return self.record(name, a) if isinstance(a, TracedNumber) else function(a)
-
-    of.__doc__ = f"Return {name} of a number."
-    return of
-
-
 class Differentiable(Trace):
     """A recording in which functions are single operations."""
-
-    sin, cos, exp, log, atan, tanh = map(_whole, ("sin", "cos", "exp", "log", "atan", "tanh"))
-    arctan = atan
 
     def tan(self, a: Any) -> Any:
         """Return the tangent."""
         return self.sin(a) / self.cos(a)
+
+    def atan(self, a: Any) -> Any:
+        """Return the arc tangent."""
+        return self.record("atan", a)
+
+    arctan = atan
+
+    def tanh(self, a: Any) -> Any:
+        """Return the hyperbolic tangent."""
+        return self.record("tanh", a)
 
     def adjoint(self, outputs: Sequence[Any], seeds: Sequence[Any], inputs: Sequence[TracedNumber]) -> list:
         """Record and return Σ seed ∂output/∂input for each input.

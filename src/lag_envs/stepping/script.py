@@ -174,43 +174,20 @@ INLINE real rough_log2(real x) { return log2(x); }
 )
 
 
-class ScriptTrace(ElementaryTrace):
-    """A recording in which function calls stay calls; a script contains each function once."""
-
-    def _function(self, name: str, a: Any) -> Any:
+def _called(name: str) -> Callable:
+    def of(self: ScriptTrace, a: Any) -> Any:
         if isinstance(a, TracedNumber):
             return self.record(name, a)
         return getattr(ElementaryTrace, name)(self, a)
 
-    def sin(self, a: Any) -> Any:
-        """Return the sine."""
-        return self._function("sin", a)
+    return of
 
-    def cos(self, a: Any) -> Any:
-        """Return the cosine."""
-        return self._function("cos", a)
 
-    def tan(self, a: Any) -> Any:
-        """Return the tangent."""
-        return self._function("tan", a)
+class ScriptTrace(ElementaryTrace):
+    """A recording in which function calls stay calls; a script contains each function once."""
 
-    def exp(self, a: Any) -> Any:
-        """Return the exponential."""
-        return self._function("exp", a)
-
-    def log(self, a: Any) -> Any:
-        """Return the natural logarithm."""
-        return self._function("log", a)
-
-    def atan(self, a: Any) -> Any:
-        """Return the arc tangent."""
-        return self._function("atan", a)
-
+    sin, cos, tan, exp, log, atan, tanh = map(_called, ("sin", "cos", "tan", "exp", "log", "atan", "tanh"))
     arctan = atan
-
-    def tanh(self, a: Any) -> Any:
-        """Return the hyperbolic tangent."""
-        return self._function("tanh", a)
 
 
 class ScriptTerm(NamedTuple):

@@ -52,6 +52,8 @@ _FLOAT: dict[str, Callable] = {
     "log": math.log,
     "sin": math.sin,
     "cos": math.cos,
+    "atan": math.atan,
+    "tanh": math.tanh,
     "abs": abs,
     "floor": math.floor,
     "pow2": _pow2,
@@ -106,6 +108,11 @@ class Operation(NamedTuple):
     args: tuple[Value, ...]
 
 
+def _operator(op: str) -> tuple[Any, Any]:
+    """Return the methods that record an operation: with the number as first and as second operand."""
+    return lambda a, b: a.trace.record(op, a, b), lambda a, b: a.trace.record(op, b, a)
+
+
 class TracedNumber:
     """A value that records the arithmetic done on it."""
 
@@ -114,29 +121,14 @@ class TracedNumber:
     def __init__(self, trace: Trace, name: str, op: str | None = None, args: tuple = ()) -> None:
         self.trace, self.name, self.op, self.args = trace, name, op, args
 
-    def __add__(self, other: Any) -> Any:
-        return self.trace.record("+", self, other)
-
-    def __radd__(self, other: Any) -> Any:
-        return self.trace.record("+", other, self)
-
-    def __sub__(self, other: Any) -> Any:
-        return self.trace.record("-", self, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return self.trace.record("-", other, self)
-
-    def __mul__(self, other: Any) -> Any:
-        return self.trace.record("*", self, other)
-
-    def __rmul__(self, other: Any) -> Any:
-        return self.trace.record("*", other, self)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self.trace.record("/", self, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self.trace.record("/", other, self)
+    __add__, __radd__ = _operator("+")
+    __sub__, __rsub__ = _operator("-")
+    __mul__, __rmul__ = _operator("*")
+    __truediv__, __rtruediv__ = _operator("/")
+    __lt__, __gt__ = _operator("<")
+    __le__, __ge__ = _operator("<=")
+    __and__, __rand__ = _operator("&")
+    __or__, __ror__ = _operator("|")
 
     def __neg__(self) -> Any:
         return self.trace.record("neg", self)
@@ -158,30 +150,6 @@ class TracedNumber:
             power = power * power
             power = power * self if bit == "1" else power
         return power if float(exponent) >= 0 else 1.0 / power
-
-    def __lt__(self, other: Any) -> Any:
-        return self.trace.record("<", self, other)
-
-    def __gt__(self, other: Any) -> Any:
-        return self.trace.record("<", other, self)
-
-    def __le__(self, other: Any) -> Any:
-        return self.trace.record("<=", self, other)
-
-    def __ge__(self, other: Any) -> Any:
-        return self.trace.record("<=", other, self)
-
-    def __and__(self, other: Any) -> Any:
-        return self.trace.record("&", self, other)
-
-    def __rand__(self, other: Any) -> Any:
-        return self.trace.record("&", other, self)
-
-    def __or__(self, other: Any) -> Any:
-        return self.trace.record("|", self, other)
-
-    def __ror__(self, other: Any) -> Any:
-        return self.trace.record("|", other, self)
 
     def __invert__(self) -> Any:
         return self.trace.record("~", self)
