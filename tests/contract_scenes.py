@@ -55,6 +55,7 @@ class RotatingFrame(Scene):
     mass: float = parameter(1.0, "kg", above=0.0)
     rate: float = parameter(0.8, "rad/s")
     spring: float = parameter(3.0, "N/m", least=0.0)
+    skew: float = parameter(0.0, "N/m²")
     drag: float = parameter(0.1, "N s/m", least=0.0)
     coordinates = {"x": "m", "y": "m"}
     controls = {"push_x": "N", "push_y": "N"}
@@ -63,7 +64,7 @@ class RotatingFrame(Scene):
         return self.mass * ((v.x - self.rate * q.y) ** 2 + (v.y + self.rate * q.x) ** 2) / 2
 
     def potential(self, q, xp):
-        return self.spring * (q.x**2 + q.y**2) / 2
+        return self.spring * (q.x**2 + q.y**2) / 2 + self.skew * (q.x**2 * q.y - q.y**3 / 3)
 
     def dissipation(self, q, v, u, xp):
         return self.drag * (v.x**2 + v.y**2) / 2

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from contract_scenes import RotatingFrame
 
 from lag_envs.report.oracle import solve_positive
 from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
@@ -123,26 +124,6 @@ def elastic(q, v, u, s, a, xp):
     return [[m, 0.0], [0.0, m]], [pull * across, pull * q[1] - m * 9.81]
 
 
-class TurningFrame(Scene):
-    """A mass in a bowl on a table that turns at a constant rate, driven by a force: T has parts T1 and T0."""
-
-    mass: float = parameter(0.5, "kg", above=0.0)
-    rate: float = parameter(7.0, "rad/s")
-    stiffness: float = parameter(30.0, "N/m", above=0.0)
-    skew: float = parameter(25.0, "N/m²")
-    coordinates = {"x": "m", "y": "m"}
-    controls = {"push": "N", "pull": "N"}
-
-    def kinetic(self, q, v, xp):
-        return 0.5 * self.mass * ((v.x - self.rate * q.y) ** 2 + (v.y + self.rate * q.x) ** 2)
-
-    def potential(self, q, xp):
-        return 0.5 * self.stiffness * (q.x**2 + q.y**2) + self.skew * (q.x**2 * q.y - q.y**3 / 3)
-
-    def applied(self, q, v, u, xp):
-        return {"x": u.push, "y": u.pull}
-
-
 def turning(q, v, u, s, a, xp):
     m, rate = xp.number(0.5), xp.number(7.0)
     x, y = q
@@ -191,6 +172,7 @@ ACROBOT = Acrobot(
 ROTARY = RotaryPendulum(
     arm_length=0.2, arm_inertia=2e-3, mass=0.1, com_distance=0.15, inertia=0.0, arm_damping=1e-3
 )
+FRAME = RotatingFrame(mass=0.5, rate=7.0, spring=30.0, skew=25.0, drag=0.0)
 SYSTEMS = (
     System("cart-pole", CartPole(friction=0.05), cart_pole, (2.0, 3.1), (3.0, 12.0), (10.0,)),
     System("acrobot", ACROBOT, acrobot, (3.1, 3.1), (6.0, 8.0), (2.0,)),
@@ -198,7 +180,7 @@ SYSTEMS = (
     System("triple pendulum", Chain(bars=3, **POINTS), chain, (3.1, 3.1, 3.1), (8.0, 8.0, 8.0), (15.0,)),
     System("rotary pendulum", ROTARY, rotary, (3.1, 3.1), (10.0, 10.0), (0.1,)),
     System("elastic pendulum", ElasticPendulum(), elastic, (0.35, 0.35), (3.0, 3.0), (15.0,), (0.3, -0.3)),
-    System("turning frame", TurningFrame(), turning, (0.5, 0.5), (4.0, 4.0), (3.0, 3.0)),
+    System("turning frame", FRAME, turning, (0.5, 0.5), (4.0, 4.0), (3.0, 3.0)),
     System("lattice", Lattice(), lattice, (1.0, 1.0), (4.0, 4.0), (5.0,)),
 )
 

@@ -10,6 +10,7 @@ from contract_scenes import ChargedParticle, RotatingHoop, Trolley
 from covering import slow
 from mpmath.libmp import to_rational
 from reference import flow, random_cases
+from series_systems import SYSTEMS
 
 from lag_envs import scenes
 from lag_envs.envs.model import Model
@@ -42,6 +43,11 @@ CASES = {
     "turning shell": (CylinderInCylinder(damping=0.24), [0.3, 1.0, 4.0], [9.0], 0.05),
     "turning plane": (Incline(control="tilt_rate", damping=0.03), [0.1, 0.2, 0.05], [0.3], 0.05),
     "two rates": (Trolley(), [0.2, 0.1, 1.0, 2.0, -0.5, -3.0], [0.7, 0.2, 0.3], 0.02),
+    **{
+        f"the series' {system.name}": (system.scene, *system.draw(np.random.default_rng(16), 0.5), 0.02)
+        for system in SYSTEMS
+        if system.name in ("acrobot", "elastic pendulum", "lattice")
+    },
 }
 
 

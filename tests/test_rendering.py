@@ -288,7 +288,7 @@ def test_forces_are_to_scale_and_point_where_they_push():
     task = TASKS[pivoted_bar.SwingUpFree.id]
     picture = Picture(task)
     now = Frame([0.0, 0.0], [0.0], [0.0])
-    (up,) = (arrow for arrow, control in Forces(task, picture).arrows(now, picture.poses(now)) if not control)
+    (up,) = (arrow for arrow, control in Forces(task, picture).arrows(now) if not control)
     (x0, y0), (x1, y1) = up.points
     window = picture.view.top - picture.view.bottom
     weight, usual = 0.2 * 9.81, Forces(task, picture)._usual["support_vertical"]
@@ -338,7 +338,7 @@ def test_controls_without_an_arrow_of_their_own_get_one():
 
     def arrows(control, state):
         now = Frame(state, control, task.share(control))
-        return [arrow.points for arrow, _ in Forces(task, picture).arrows(now, picture.poses(now))]
+        return [arrow.points for arrow, _ in Forces(task, picture).arrows(now)]
 
     (pushed,) = arrows([1.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0])
     assert pushed[0] == pytest.approx((0.5, 0.0)) and pushed[1][0] > 0.6

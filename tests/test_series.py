@@ -746,19 +746,6 @@ def test_error_of_many_control_steps(system, dt, order):
     assert max(step_error(system, *system.draw(generator), dt, order) for _ in range(20)) < 1e-12
 
 
-@pytest.mark.parametrize(
-    "system", [SYSTEMS[1], *map(slow, (SYSTEMS[5], SYSTEMS[7]))], ids=lambda system: system.name
-)
-def test_jacobian_is_that_of_exact_steps(system):
-    state, control = system.draw(np.random.default_rng(16), 0.5)
-    numbers = parameter_values(system.scene)
-    tangent = stepper(system.scene)[0].tangent(numbers)
-    found, refused = tangent.jacobian(np.array([state]), np.array([control]), 0.02, 16)
-    expected = exact_slopes(system, state, control, 0.02)
-    assert not refused
-    np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-
-
 @pytest.mark.parametrize("order", range(SMALLEST_ORDER, LARGEST_ORDER + 1))
 def test_every_order(order):
     system = SYSTEMS[2]

@@ -226,7 +226,7 @@ def test_one_step_of_many(kind, capsys):
 
 @cache
 def any_pendulum():
-    return pendulum.compile_flow((True,) * 5)
+    return pendulum.compile_flow()
 
 
 def pendulum_errors(theta, omega, drive, dt):
@@ -359,7 +359,7 @@ def test_fixed_slope(decay, sign):
     """drag dt on both sides of each change of formula; a negative drag pushes."""
     if sign * decay < -700.0:
         return
-    step = slope.compile_slide((True, True))
+    step = slope.compile_slide()
     for dt in (1e-6, 0.02, 1.0):
         for x, v, pull in ((0.3, -2.0, 5.0), (0.0, 0.0, 9.81), (1e3, 1e4, -0.1), (-1.0, 1.0, 0.0)):
             drag = sign * decay / dt
@@ -376,7 +376,7 @@ def test_fixed_slope(decay, sign):
 @pytest.mark.parametrize("rate", [0.0, 1e-300, -1e-12, 1e-3, 1.0, -40.0])
 def test_turning_slope(decay, rate):
     """From a still plane to one that turns by 40 rad/s, on both sides of where short steps begin."""
-    step = slope.compile_turn((True,) * 4)
+    step = slope.compile_turn()
     k, gravity = 2.0 / 3.0, 9.81
     for dt in (0.02, 0.5):
         drag = decay / dt

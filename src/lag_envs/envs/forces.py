@@ -7,7 +7,7 @@ pushes the first body that the coordinate moves, in the direction in which the c
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.mechanics.recording import Values
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.picture import Picture, places
-from lag_envs.scenes.shapes import Arrow, Frame, Point, Pose, arc
+from lag_envs.scenes.shapes import Arrow, Frame, Point, arc
 from lag_envs.tasks.base import Task
 
 #: Length of the arrow of the largest control, or of a force of usual size, as a share of the window; and the
@@ -45,7 +45,7 @@ class Forces:
         self._reactions = dict(layout_of(self._scene).reactions)
         self._usual = self._sizes()
 
-    def arrows(self, now: Frame, poses: Sequence[Pose]) -> Iterator[tuple[Arrow, bool]]:
+    def arrows(self, now: Frame) -> Iterator[tuple[Arrow, bool]]:
         """Yield the arrows of a moment, and whether each is a control's."""
         q = places(self._scene, now)
         for name, share in zip(self._scene.control_names, np.atleast_1d(now.share), strict=True):

@@ -174,7 +174,7 @@ class Viewer:
     ) -> NDArray[np.uint8]:
         width, height = self._size
         image = np.full((height, width, 3), 255, np.uint8)
-        more = list(self._more(now, poses))
+        more = list(self._more(now))
         readings = self._readings(now, seconds, total, over) if self._look.readout else None
         if self._pen is None:
             self._readout = None if readings is None else Readout(readings, self._size)
@@ -184,7 +184,7 @@ class Viewer:
             self._readout.write(image, readings, self._pen.scale)
         return image
 
-    def _more(self, now: Frame, poses: list[Pose]) -> Iterator[StyledShape]:
+    def _more(self, now: Frame) -> Iterator[StyledShape]:
         """Yield trail and arrows."""
         pieces = min(12, len(self._trail) - 1)
         for tip in range(len(self._tips)):
@@ -193,7 +193,7 @@ class Viewer:
                 part = way[i * (len(way) - 1) // pieces : (i + 1) * (len(way) - 1) // pieces + 1]
                 yield StyledShape(s.Line(part), TRAIL, (i + 1.0) / pieces)
         if self._forces is not None:
-            for arrow, is_control in self._forces.arrows(now, poses):
+            for arrow, is_control in self._forces.arrows(now):
                 yield StyledShape(arrow, STYLES["action"] if is_control else FORCE, 1.0)
 
     def _readings(self, now: Frame, seconds: float, total: float, over: bool) -> list[list[Reading]]:

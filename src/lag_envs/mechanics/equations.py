@@ -42,30 +42,21 @@ class Energies:
 
 @dataclasses.dataclass(frozen=True)
 class EquationsOfMotion:
-    """The equations of motion ``Σ_j mass[i, j] a_j = force[i]``, and what goes with them.
+    """The equations of motion ``Σ_j mass[i, j] a_j = force[i]``.
 
     Attributes
     ----------
     coordinates : tuple of str
         The free coordinates, then the prescribed ones.
-    free : int
-        Number of free coordinates.
     mass : dict
         Entries G_ij with i <= j, over all coordinates; those that vanish are left out.
-    linear : tuple of Expr
-        b_i, the part of T that is linear in the velocities.
     force : tuple of Expr
         For each coordinate, all of its equation except Σ_j G_ij a_j, moved to the right-hand side.
-    energies : Energies
-        The formulas.
     """
 
     coordinates: tuple[str, ...]
-    free: int
     mass: Mapping[tuple[int, int], Expr]
-    linear: tuple[Expr, ...]
     force: tuple[Expr, ...]
-    energies: Energies
 
     def entry(self, i: int, j: int) -> Expr:
         """Return G_ij."""
@@ -113,7 +104,6 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
                 f"kinetic does not contain the rate of {name!r} squared, so nothing determines its "
                 f"acceleration; give it a mass, or prescribe {name!r}"
             )
-    linear = tuple(Expr({m: c for m, c in momentum.terms.items() if _degree(m) == 0}) for momentum in momenta)
     force = []
     for name, momentum in zip(names, momenta, strict=True):
         q, v = place(name), velocity(name)
@@ -123,8 +113,7 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
         total = derivative(kinetic, q) - convective - derivative(energies.potential, q)
         total = total - derivative(energies.dissipation, v) + energies.applied.get(name, Expr({}))
         force.append(apply_identities(total))
-    collected = dataclasses.replace(energies, kinetic=kinetic)
-    return EquationsOfMotion(tuple(names), len(free), mass, linear, tuple(force), collected)
+    return EquationsOfMotion(names, mass, tuple(force))
 
 
 def _check_velocities(kinetic: Expr) -> None:

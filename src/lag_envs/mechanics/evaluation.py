@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -136,12 +136,26 @@ def _parts(x: Any) -> tuple[Any, Any]:
     return (x.value, x.slope) if isinstance(x, DualArray) else (np.asarray(x, dtype=np.float64), 0.0)
 
 
-def _carried(function: Any, slope: Any) -> Any:
+#: The derivative of each function, from its argument, its value, and the functions.
+RATES: Mapping[str, Callable[[Any, Any, Any], Any]] = {
+    "sin": lambda x, y, xp: xp.cos(x),
+    "cos": lambda x, y, xp: -xp.sin(x),
+    "exp": lambda x, y, xp: y,
+    "log": lambda x, y, xp: 1.0 / x,
+    "sqrt": lambda x, y, xp: 0.5 / y,
+    "atan": lambda x, y, xp: 1.0 / (1.0 + x * x),
+    "tanh": lambda x, y, xp: 1.0 - y * y,
+}
+
+
+def _carried(name: str) -> Any:
+    function, rate = getattr(Numeric, name), RATES[name]
+
     def of(x: Any) -> Any:
         if not isinstance(x, DualArray):
             return function(x)
         y = function(x.value)
-        return DualArray(y, slope(x.value, y)[..., None] * x.slope)
+        return DualArray(y, rate(x.value, y, Numeric)[..., None] * x.slope)
 
     return staticmethod(of)
 
@@ -149,13 +163,8 @@ def _carried(function: Any, slope: Any) -> Any:
 class DualArrayFunctions:
     """The functions of `Numeric` on `DualArray` numbers."""
 
-    sin = _carried(np.sin, lambda x, y: np.cos(x))
-    cos = _carried(np.cos, lambda x, y: -np.sin(x))
-    exp = _carried(np.exp, lambda x, y: y)
-    log = _carried(np.log, lambda x, y: 1.0 / x)
-    sqrt = _carried(np.sqrt, lambda x, y: 0.5 / y)
-    atan = arctan = _carried(np.arctan, lambda x, y: 1.0 / (1.0 + x * x))
-    tanh = _carried(np.tanh, lambda x, y: 1.0 - y * y)
+    sin, cos, exp, log, sqrt, atan, tanh = map(_carried, RATES)
+    arctan = atan
 
 
 def eliminated(matrix: Sequence[Sequence], right: Sequence) -> list:
@@ -303,8 +312,7 @@ class MotionPoint:
             row = full.coordinates.index(m)
             fields = self.of([full.entry(full.coordinates.index(name), row) for name in moving])
             drive = drive - self.acceleration[m] * sum(g * v for g, v in zip(fields, speeds, strict=True))
-        energies = self.mechanics.full.energies
-        applied = self.of([energies.applied.get(name, Expr({})) for name in moving])
+        applied = self.of([self.mechanics.applied.get(name, Expr({})) for name in moving])
         drag = self.of([self.mechanics.drag[name] for name in moving])
         return {
             "drive": drive,

@@ -14,7 +14,7 @@ from typing import Any
 
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative, substitute
-from lag_envs.mechanics.equations import Energies, EquationsOfMotion, derive, place, velocity
+from lag_envs.mechanics.equations import EquationsOfMotion, derive, place, velocity
 from lag_envs.mechanics.layout import Prescribed, SceneLayout
 from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
 
@@ -103,10 +103,20 @@ class Mechanics:
         return {key: self._rate(entry) for key, entry in self.coupling.items()}
 
     @cached_property
+    def _known(self) -> dict[Atom, Expr]:
+        return _held(self.layout, self.record)
+
+    @cached_property
+    def applied(self) -> dict[str, Expr]:
+        """Applied generalised forces by coordinate."""
+        given = self.record.energies.applied
+        return {name: substitute(force, self._known) for name, force in given.items()}
+
+    @cached_property
     def drag(self) -> dict[str, Expr]:
         """∂D/∂v of each coordinate."""
-        held, loss = _held(self.layout, self.record), self.record.energies.dissipation
-        return {name: substitute(derivative(loss, velocity(name)), held) for name in self.layout.names}
+        loss = self.record.energies.dissipation
+        return {name: substitute(derivative(loss, velocity(name)), self._known) for name in self.layout.names}
 
     @cached_property
     def gyroscopic(self) -> tuple[Expr, Expr] | None:
@@ -116,15 +126,12 @@ class Mechanics:
             degree = sum(n for atom, n in monomial if atom.kind == "velocity")
             if degree < 2:
                 parts[1 - degree][monomial] = c
-        held = _held(self.layout, self.record)
-        first, rest = (substitute(Expr(terms), held) for terms in parts)
+        first, rest = (substitute(Expr(terms), self._known) for terms in parts)
         return (first, rest) if any(parts) else None
 
     def weight(self, name: str) -> list[Expr]:
         """Return the terms of ∂V/∂q of a coordinate without sines and cosines, which are 1 at most."""
-        slope = substitute(
-            derivative(self.record.energies.potential, place(name)), _held(self.layout, self.record)
-        )
+        slope = substitute(derivative(self.record.energies.potential, place(name)), self._known)
         bare = []
         for monomial, c in slope.sorted_terms():
             bare.append(Expr({tuple((a, n) for a, n in monomial if a.function not in ("sin", "cos")): c}))
@@ -139,22 +146,11 @@ class Mechanics:
         """
         moving = [p.name for p in self.layout.prescribed]
         found = derive(self.layout.free, moving, self.record.energies)
-        held = _held(self.layout, self.record)
-        mass = {ij: substitute(entry, held) for ij, entry in found.mass.items()}
-        e = found.energies
-        energies = Energies(
-            substitute(e.kinetic, held),
-            substitute(e.potential, held),
-            substitute(e.dissipation, held),
-            {name: substitute(value, held) for name, value in e.applied.items()},
-        )
+        mass = {ij: substitute(entry, self._known) for ij, entry in found.mass.items()}
         return EquationsOfMotion(
             found.coordinates,
-            found.free,
             {ij: entry for ij, entry in mass.items() if entry.terms},
-            tuple(substitute(b, held) for b in found.linear),
-            tuple(substitute(f, held) for f in found.force),
-            energies,
+            tuple(substitute(f, self._known) for f in found.force),
         )
 
 

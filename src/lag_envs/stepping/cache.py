@@ -147,18 +147,11 @@ class _DispatcherCache:
 
     def __init__(self, name: str, key: str) -> None:
         self._name, self._key = re.sub(r"\W", "", name), key
-        self._enabled = True
 
     @property
     def cache_path(self) -> str | None:
         place = folder()
         return None if place is None else str(place)
-
-    def enable(self) -> None:
-        self._enabled = True
-
-    def disable(self) -> None:
-        self._enabled = False
 
     def flush(self) -> None:
         """Forget everything compiled from this function."""
@@ -169,7 +162,7 @@ class _DispatcherCache:
     def load_overload(self, types: Any, target: Any) -> Any:
         """Return the compiled function for these types of arguments, or None."""
         place = folder()
-        if not self._enabled or place is None:
+        if place is None:
             return None
         path, key = self._entry(place, types, target.codegen())
         return _load(path, key, lambda content: _rebuild(content, target))
@@ -177,7 +170,7 @@ class _DispatcherCache:
     def save_overload(self, types: Any, result: Any) -> None:
         """Keep a compiled function; do nothing if that is impossible."""
         place = folder()
-        if not self._enabled or place is None or result.lifted or result.library.has_dynamic_globals:
+        if place is None or result.lifted or result.library.has_dynamic_globals:
             return
         path, key = self._entry(place, types, result.codegen)
         with contextlib.suppress(OSError):

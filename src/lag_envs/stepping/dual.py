@@ -10,12 +10,13 @@ derivative.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.mechanics.evaluation import Numeric
+from lag_envs.mechanics.evaluation import RATES, Numeric
 from lag_envs.stepping.lowering import SeriesRecord
 
 
@@ -229,41 +230,12 @@ class VariableFunctions:
 
     def __init__(self, xp: Any = Numeric) -> None:
         self._xp = xp
+        for name in RATES:
+            setattr(self, name, partial(self._call, name))
 
-    def _of(self, x: Any, value: Any, rate: Any) -> Any:
-        return Variable(value, x.slopes * rate) if isinstance(x, Variable) else value
-
-    def sin(self, x: Any) -> Any:
-        """Return the sine."""
-        a = getattr(x, "value", x)
-        return self._of(x, self._xp.sin(a), self._xp.cos(a))
-
-    def cos(self, x: Any) -> Any:
-        """Return the cosine."""
-        a = getattr(x, "value", x)
-        return self._of(x, self._xp.cos(a), -self._xp.sin(a))
-
-    def exp(self, x: Any) -> Any:
-        """Return the exponential."""
-        value = self._xp.exp(getattr(x, "value", x))
-        return self._of(x, value, value)
-
-    def log(self, x: Any) -> Any:
-        """Return the natural logarithm."""
-        a = getattr(x, "value", x)
-        return self._of(x, self._xp.log(a), 1.0 / a)
-
-    def sqrt(self, x: Any) -> Any:
-        """Return the square root."""
-        value = self._xp.sqrt(getattr(x, "value", x))
-        return self._of(x, value, 0.5 / value)
-
-    def atan(self, x: Any) -> Any:
-        """Return the arc tangent."""
-        a = getattr(x, "value", x)
-        return self._of(x, self._xp.atan(a), 1.0 / (1.0 + a * a))
-
-    def tanh(self, x: Any) -> Any:
-        """Return the hyperbolic tangent."""
-        value = self._xp.tanh(getattr(x, "value", x))
-        return self._of(x, value, 1.0 - value * value)
+    def _call(self, name: str, x: Any) -> Any:
+        function = getattr(self._xp, name)
+        if not isinstance(x, Variable):
+            return function(x)
+        value = function(x.value)
+        return Variable(value, x.slopes * RATES[name](x.value, value, self._xp))

@@ -30,12 +30,13 @@ class Flow(NamedTuple):
     """An exact flow and the ways to run it.
 
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
-    ``within(variables, coefficients, dt, x, xp)`` tells whether a step is ordinary, and ``compile(present)``
-    makes the scalar function for any step. ``pull(variables, coefficients, dt, bars, xp)`` records an
-    ordinary step backwards, from cotangents of the first two variables to those of variables and
-    coefficients. ``compile_tangent(present, by)`` makes the function that differentiates any step with
-    respect to the variables and the named coefficients. ``order`` is the order of the certified series, 0 if
-    there is none. ``method`` describes how a step is taken.
+    ``within(variables, coefficients, dt, x, xp)`` tells whether a step is ordinary, and ``compile(absent)``
+    makes the scalar function for any step; `absent` names the coefficients that are zero.
+    ``pull(variables, coefficients, dt, bars, xp)`` records an ordinary step backwards, from cotangents of the
+    first two variables to those of variables and coefficients. ``compile_tangent(absent, by)`` makes the
+    function that differentiates any step with respect to the variables and the coefficients in `by`.
+    ``order`` is the order of the certified series, 0 if there is none. ``method`` describes how a step is
+    taken.
     """
 
     size: int
@@ -64,8 +65,8 @@ def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda variables, drive, dt, bars, xp: pendulum.pull(variables, drive, dt, bars, order),
-        lambda present: pendulum.compile_flow(present, order),
-        lambda present, by: pendulum.compile_tangent(present, by, order),
+        lambda absent: pendulum.compile_flow(absent, order),
+        lambda absent, by: pendulum.compile_tangent(absent, by, order),
         f"one Taylor series of order {order}, no trigonometry",
     )
 
@@ -224,15 +225,16 @@ class Stepper:
 
         #: An ordinary step, without branches; ``within`` tells whether the step was ordinary.
         self.fast = [*prepared, *tested, *moved, *finished]
-        present = tuple(not isinstance(v, float) for v in values[flow.size :])
+        by_name = dict(zip(flow.coefficients._fields, values[flow.size :], strict=True))
+        left_out = frozenset(name for name, value in by_name.items() if isinstance(value, float))
         #: Names of the flow's coefficients, and whether each is in the code.
-        self.terms = dict(zip(flow.coefficients._fields, present, strict=True))
+        self.terms = {name: name not in left_out for name in by_name}
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
         #: The lines of any step.
         self.any_step = [*prepared, call, *finished]
         #: Returns the function that these lines call.
-        self.engine = lambda: flow.compile(present)
-        self._tangent = lambda by: flow.compile_tangent(present, by)
+        self.engine = lambda: flow.compile(left_out)
+        self._tangent = lambda by: flow.compile_tangent(left_out, by)
         self._given, self._prepare, self._finish, self._form = given, prepare, finish, form
         self._names = [f"k_{name}" for name in constants]
 

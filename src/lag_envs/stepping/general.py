@@ -630,14 +630,14 @@ class StepCode:
         return compile_function("simulate", "\n    ".join(body) + "\n", self.engine(tolerance))
 
 
-_steppers: dict[str, SeriesStepper] = {}
+_steppers: dict[tuple[type[SeriesStepper], str], SeriesStepper] = {}
 
 
-def stepper_of(mechanics: Mechanics) -> SeriesStepper:
+def stepper_of(mechanics: Mechanics, kind: type[SeriesStepper] = SeriesStepper) -> SeriesStepper:
     """Return the stepper of these equations of motion; equal equations share one."""
-    if mechanics.key not in _steppers:
-        _steppers[mechanics.key] = SeriesStepper(mechanics)
-    return _steppers[mechanics.key]
+    if (kind, mechanics.key) not in _steppers:
+        _steppers[kind, mechanics.key] = kind(mechanics)
+    return _steppers[kind, mechanics.key]
 
 
 def series_code_of(scene: Any) -> tuple[StepCode, list[float]]:

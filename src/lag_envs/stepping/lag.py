@@ -15,7 +15,7 @@ from lag_envs.mechanics.algebra import Atom, Expr
 from lag_envs.mechanics.equations import velocity
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.stepping.elementary import fading
-from lag_envs.stepping.general import SeriesStepper
+from lag_envs.stepping.general import SeriesStepper, stepper_of
 from lag_envs.stepping.lowering import CLOCK, FADING, Lowering
 
 
@@ -124,11 +124,6 @@ class LaggedStepper(SeriesStepper):
         return after, ends
 
 
-_steppers: dict[str, LaggedStepper] = {}
-
-
-def lagged_stepper(mechanics: Mechanics) -> LaggedStepper:
+def lagged_stepper(mechanics: Mechanics) -> SeriesStepper:
     """Return the stepper of these equations of motion with lagged controls; equal equations share one."""
-    if mechanics.key not in _steppers:
-        _steppers[mechanics.key] = LaggedStepper(mechanics)
-    return _steppers[mechanics.key]
+    return stepper_of(mechanics, LaggedStepper)

@@ -538,13 +538,13 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
 
 
 @cache
-def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
+def compile_flow(absent: frozenset[str] = frozenset(), order: int = ORDER) -> Callable:
     """Compile `_flow` for a pendulum that has only some of the terms.
 
     Parameters
     ----------
-    present : tuple of bool
-        For each coefficient of `Coefficients`, whether it is present; the others leave no code.
+    absent : frozenset of str
+        Coefficients that are zero: they leave no code.
     order : int, default 16
         Order of the series.
 
@@ -554,16 +554,15 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
         ``flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x)`` to
         ``(theta, omega, c, s, substeps)``; `substeps` is negative if the step is refused.
     """
-    holds, series = _compile_parts(present, order)
+    holds, series = _compile_parts(absent, order)
     divided = compile_python("divided", _divided, *_divided_parts(order))
     plan, slow = _compile_plan(), _compile_slow_motion(_no_slopes)
     return compile_python("flow", _flow, holds, series, plan, divided, slow, order=order)
 
 
 @cache
-def _compile_parts(present: tuple[bool, ...], order: int) -> tuple[Callable, Callable]:
+def _compile_parts(absent: frozenset[str], order: int) -> tuple[Callable, Callable]:
     """Compile the condition of the bound, and one step of the series."""
-    absent = frozenset(name for name, there in zip(Coefficients._fields, present, strict=True) if not there)
     coefficients = "alpha, beta, gamma, delta, ramp"
     series = compile_traced(
         "series",
@@ -669,19 +668,18 @@ def _tangent(values, slopes, scratch, dt, x):  # type: ignore[no-untyped-def]
 
 
 @cache
-def compile_tangent(present: tuple[bool, ...], by: tuple[str, ...], order: int = ORDER) -> Callable:
+def compile_tangent(absent: frozenset[str], by: tuple[str, ...], order: int = ORDER) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, x)``, see `_tangent`; `scratch` has four rows.
 
     Parameters
     ----------
-    present : tuple of bool
-        For each coefficient of `Coefficients`, whether it is present.
+    absent : frozenset of str
+        Coefficients that are zero.
     by : tuple of str
         Coefficients that have derivatives.
     order : int, default 16
         Order of the series.
     """
-    absent = frozenset(name for name, there in zip(Coefficients._fields, present, strict=True) if not there)
     columns, n = ("theta", "omega", *by), len(by) + 2
     numbers = ("omega", "c", "s", *Coefficients._fields, "h", "elapsed")
     trace = Trace()
@@ -696,7 +694,7 @@ def compile_tangent(present: tuple[bool, ...], by: tuple[str, ...], order: int =
         *(f"change[{i // n}, {i % n}] = {x}" for i, x in enumerate(entries)),
     ]
     rows = (0, 1, *(4 + Coefficients._fields.index(name) for name in by))
-    holds, _ = _compile_parts(present, order)
+    holds, _ = _compile_parts(absent, order)
     return compile_python(
         "tangent",
         _tangent,

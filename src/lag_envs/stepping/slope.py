@@ -131,9 +131,8 @@ def crossing_time(x: Any, v: Any, force: FixedSlope, dt: Any, xp: Any) -> Any:
 
 
 @cache
-def compile_slide(present: tuple[bool, ...]) -> Callable:
+def compile_slide(absent: frozenset[str] = frozenset()) -> Callable:
     """Compile ``flow(x, v, acceleration, damping_rate, dt, _)`` to ``(x, v, 1)``, negative if refused."""
-    absent = frozenset(name for name, there in zip(FixedSlope._fields, present, strict=True) if not there)
     fast = compile_traced(
         "slide",
         "x, v, acceleration, damping_rate, dt",
@@ -182,7 +181,7 @@ def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-d
 
 
 @cache
-def compile_slide_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
+def compile_slide_tangent(absent: frozenset[str], by: tuple[str, ...]) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_slide_tangent`; all terms are allowed."""
 
     def short(xp: Any, z: Any) -> tuple:
@@ -327,9 +326,8 @@ def _turn_any(x, v, c, s, centrifugal, gravity, damping_rate, rate, dt, _):  # t
 
 
 @cache
-def compile_turn(present: tuple[bool, ...]) -> Callable:
+def compile_turn(absent: frozenset[str] = frozenset()) -> Callable:
     """Compile ``flow(x, v, c, s, *TurningSlope, dt, _)`` to ``(x, v, c, s, 1)``."""
-    absent = frozenset(name for name, there in zip(TurningSlope._fields, present, strict=True) if not there)
     arguments = "x, v, c, s, centrifugal, gravity, damping_rate, rate, h"
     series, change = (
         compile_traced(
@@ -422,7 +420,7 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
 
 
 @cache
-def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
+def compile_turn_tangent(absent: frozenset[str], by: tuple[str, ...]) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; all terms are allowed."""
     names = ("x", "v", "c", "s", *TurningSlope._fields, "h")
     columns = tuple(name for name in TurningSlope._fields if name == "rate" or name in by)

@@ -10,12 +10,6 @@ from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.lag import lagged_stepper
 
 
-def lagged_code(scene: Any, constants: Mapping[str, Any]) -> Any:
-    """Return the code of a scene's step with lag, without the terms of constants that are zero."""
-    lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
-    return lagged_stepper(scene.mechanics).code(absent_from(lagged))
-
-
 class LaggedCode:
     """The code of a step with lag, under the names of an environment's program.
 
@@ -41,7 +35,8 @@ class LaggedCode:
         lift_end: Sequence[str],
         constants: Mapping[str, Any],
     ) -> None:
-        code = lagged_code(scene, constants)
+        lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
+        code = lagged_stepper(scene.mechanics).code(absent_from(lagged))
         n = range(len(code.controls) // 3)
         self.start, self.end = start, end
         self.in_force = [f"reached{i}" for i in n]
