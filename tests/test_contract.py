@@ -323,15 +323,6 @@ def test_energy_reports_jacobis_integral_where_it_differs():
     assert energy["kinetic"] == [30.0] and energy["jacobi"] == [10.25]
 
 
-def test_needed_friction_is_infinite_where_the_contact_carries_nothing():
-    shell = CylinderInCylinder(control="damping")
-    mu = shell.forces([[0.5, 0.0], [math.pi / 2, 0.0], [3.0, 0.0]])["needed_friction"]
-    assert mu[0] == pytest.approx(math.tan(0.5) / 3) and list(mu[1:]) == [math.inf, math.inf]
-    weightless = CylinderInCylinder(control="damping", gravity=0.0)
-    assert weightless.forces([0.0, 0.0])["needed_friction"] == math.inf
-    assert weightless.forces([0.0, 1.0])["needed_friction"] == 0.0
-
-
 def test_forces_of_what_moves_have_names():
     class Rail(cart(False)):
         prescribed = {"s": "m", "h": "m"}

@@ -21,6 +21,37 @@ RENDER_MODES = ["human", "rgb_array"]
 FLOAT32 = np.dtype(np.float32)
 
 
+class TaskEnv:
+    """The part that the single environment and the batch share.
+
+    Attributes
+    ----------
+    task : Task
+        The task; the first one of a batch.
+    """
+
+    task: Task
+    #: Steps of an episode; infinity for one without an end.
+    _limit: float
+    _started: bool
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How it was made. Its step limit is the one that the environment itself enforces."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = None if value is None else true_spec(value, self._limit)
+
+    @property
+    def _drawn(self) -> list[str]:
+        """Names of the parameters that are drawn for each episode; none before the first."""
+        found = self.task.imperfections
+        return [d.name for d in found.drawn] if found and self._started else []
+
+
 def true_spec(spec: EnvSpec, limit: float) -> EnvSpec:
     """Return a copy of a spec with the number of steps of an episode, in a form that can be written as JSON.
 

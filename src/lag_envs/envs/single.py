@@ -7,7 +7,6 @@ from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
@@ -18,6 +17,7 @@ from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.interface import (
     FLOAT32,
     RENDER_MODES,
+    TaskEnv,
     check_flag,
     check_look,
     check_render_mode,
@@ -26,7 +26,6 @@ from lag_envs.envs.interface import (
     observation_space,
     seed_key,
     start_options,
-    true_spec,
 )
 from lag_envs.envs.program import SLOW
 from lag_envs.scenes.checks import StepRefused
@@ -34,7 +33,7 @@ from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
 
-class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One environment of any task; made by ``gym.make(id, **parameters)``.
 
     ``help(env.unwrapped.task)`` describes its task.
@@ -95,7 +94,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         #: Whether there is something to draw or count after each step.
         self._seen = render_mode == "human" or bool(show_readout)
         self.task: Task = load_task(task)(**options)
-        self.scene = self.task.scene
+        self.scene, self._limit = self.task.scene, self.task.limit
         self.__doc__ = self.task.__doc__
         self.render_mode = render_mode
         self.diagnostics = diagnostics
@@ -315,9 +314,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def parameters(self) -> dict[str, float]:
         """The parameters drawn for this episode, by name; empty if none are drawn."""
-        found = self.task.imperfections
-        drawn = [d.name for d in found.drawn] if found and self._started else []
-        return dict(zip(drawn, self._read([f"p_{name}" for name in drawn]).tolist(), strict=True))
+        return dict(zip(self._drawn, self._read([f"p_{name}" for name in self._drawn]).tolist(), strict=True))
 
     @property
     def drawn_task(self) -> Task:
@@ -332,16 +329,6 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _read(self, names: list[str]) -> NDArray[np.float64]:
         return self._rows[[self._row[name] for name in names]]
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How the environment was made. Its step limit is the one that the environment itself enforces."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = None if value is None else true_spec(value, self.task.limit)
-
-    _spec: EnvSpec | None = None
     #: Sum of the episode's rewards, if pictures show it.
     _total = 0.0
 

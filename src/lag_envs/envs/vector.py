@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -20,6 +19,7 @@ from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.interface import (
     FLOAT32,
+    TaskEnv,
     check_flag,
     check_look,
     check_render_mode,
@@ -28,7 +28,6 @@ from lag_envs.envs.interface import (
     observation_space,
     seed_key,
     start_options,
-    true_spec,
 )
 from lag_envs.envs.program import BLOCK
 from lag_envs.scenes import StepRefused
@@ -42,7 +41,7 @@ BOOL = np.dtype(np.bool_)
 SEQUENCES = (list, tuple, np.ndarray)
 
 
-class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
+class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
     """Many environments of one task, stepped together.
 
     Made by ``gym.make_vec(id, num_envs=..., **parameters)``.
@@ -148,6 +147,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             steps = float(check_count("max_episode_steps", max_episode_steps))
             for constants in self._constants:
                 constants["limit"] = min(constants["limit"], steps)
+        self._limit = self._constants[0]["limit"]
         self._compile()
         program = self._program
         uniform = [self._constants[0][name] for name in program.uniform]
@@ -397,8 +397,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _about(self) -> dict[str, Any]:
         """The properties that a snapshot must share."""
         options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
-        limit = self._constants[0]["limit"]
-        return snapshots.properties(self.tasks, **options, max_episode_steps=limit, order=self.order)
+        return snapshots.properties(self.tasks, **options, max_episode_steps=self._limit, order=self.order)
 
     # --- for inspection ------------------------------------------------------------------------------------
 
@@ -431,9 +430,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     @property
     def parameters(self) -> dict[str, NDArray[np.float64]]:
         """The parameters drawn for these episodes, shape (num_envs,) each; empty if none are drawn."""
-        found = self.task.imperfections
-        drawn = [d.name for d in found.drawn] if found and self._started else []
-        return {name: self._read(f"p_{name}") for name in drawn}
+        return {name: self._read(f"p_{name}") for name in self._drawn}
 
     @property
     def num_threads(self) -> int:
@@ -456,17 +453,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             raise ValueError(f"{type(self.task).__name__} has a flow of its own: there is no order to choose")
         for par in self._pars:
             par[self._program.uniform.index(name)] = check_order("order", value)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How the environments were made; its step limit is the one that they enforce themselves."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = None if value is None else true_spec(value, self._constants[0]["limit"])
-
-    _spec: EnvSpec | None = None
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: the current pictures, spaces, controls, parameters."""
