@@ -15,6 +15,7 @@ from lag_envs.envs.model import Model
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
 from lag_envs.scenes.derivation import form_of
+from lag_envs.stepping.normal_forms import lifted
 from lag_envs.tasks import TASKS
 
 
@@ -158,21 +159,16 @@ class Exactly:
 
 def exact_results(task, state, action, target, parameters):
     """Return state, observation and reward after a step, in mpmath's arithmetic."""
-    xp, f, scene = Exactly(), task.formulas, task.scene
+    xp, f, scene, form = Exactly(), task.formulas, task.scene, form_of(task.scene)
     constants = f.constants() | {f"self_{name}": value for name, value in parameters.items()}
     k = SimpleNamespace(**{name: mpmath.mpf(value) for name, value in constants.items()})
-    angle = None if form_of(scene) is None else form_of(scene).angle
-
-    def lifted(y):
-        return [*y] if angle is None else [*y, mpmath.cos(y[angle]), mpmath.sin(y[angle])]
-
     top = f.largest
-    u = f.control(xp, [min(max(a, -top), top) for a in action], lifted(state), target, k)
+    u = f.control(xp, [min(max(a, -top), top) for a in action], lifted(form, state, mpmath), target, k)
     end = list(exact_step(scene, state, u, task.dt, parameters))
-    reward, ended = f.outcome(xp, lifted(state), lifted(end), u, target, k)
+    reward, ended = f.outcome(xp, lifted(form, state, mpmath), lifted(form, end, mpmath), u, target, k)
     if ended and f.has_last:
-        reward = f.last(xp, lifted(state), lifted(end), u, target, k)
-    return [*end, *f.observe(xp, lifted(end), target, k), reward]
+        reward = f.last(xp, lifted(form, state, mpmath), lifted(form, end, mpmath), u, target, k)
+    return [*end, *f.observe(xp, lifted(form, end, mpmath), target, k), reward]
 
 
 def starts(task, rng, n):

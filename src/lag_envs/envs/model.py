@@ -14,6 +14,7 @@ from lag_envs.envs.reverse import Reverse
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import absent_from
+from lag_envs.stepping.normal_forms import lifted
 from lag_envs.tasks.base import Task, check_task
 
 Array = NDArray[np.float64]
@@ -281,13 +282,8 @@ class Model:
         moves = _moves(m)
         given = np.concatenate([states, acting], axis=-1).T + moves[..., None]  # (moves, m, n)
 
-        def lifted(y: Array) -> list[Array]:
-            rows = list(np.moveaxis(y, -2, 0))
-            angle = None if form is None else form.angle
-            return rows if angle is None else [*rows, np.cos(rows[angle]), np.sin(rows[angle])]
-
         with np.errstate(all="ignore"):
-            y = lifted(given[:, :width])
+            y = lifted(form, np.moveaxis(given[:, :width], -2, 0), np)
             applied = formulas.control(np, list(np.moveaxis(given[:, width:], 1, 0)), y, goals, k)
             u = np.zeros((len(moves), len(applied), n))
             for i, values in enumerate(applied):
@@ -296,7 +292,7 @@ class Model:
             by_both = np.concatenate([by_state, by_control], axis=-1)
             inner = np.concatenate([given[:, :width] - states.T, u - u[0]], axis=1)
             after = ends.T + np.einsum("nij,pjn->pin", by_both, inner)
-            z = lifted(after)
+            z = lifted(form, np.moveaxis(after, -2, 0), np)
             reward, ended = formulas.outcome(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
             if formulas.has_last:
                 last = formulas.last(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
@@ -321,8 +317,8 @@ class Model:
         ValueError
             For values that are not finite or have another shape.
         """
-        array, form = self._checked_states(states), form_of(self.task.scene)
-        rows = form.lift(array) if form else tuple(array.T)
+        array = self._checked_states(states)
+        rows = lifted(form_of(self.task.scene), array.T, np)
         numbers = _rows("draws", draws, (self.task.draws, len(array)), single=False)
         kicked = self.task.formulas.kick(np, list(numbers), rows, self._constants)
         return np.stack(np.broadcast_arrays(*kicked[: self._n_state]), axis=-1)

@@ -174,11 +174,7 @@ class Program:
 
         def start(xp: Any, *values: Any) -> list:
             draws, rest = split_lengths(values, states + targets)
-            numbers = vars(k(rest))
-            state = [
-                numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)
-            ]
-            return state + formulas.sample_targets(draws[states:], numbers)
+            return formulas.sample_start(draws, vars(k(rest)))
 
         def lines(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
             return recorded_lines(formula, inputs, outputs, formulas.trace)

@@ -20,6 +20,7 @@ from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import check_turns, pulled
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split_lengths
+from lag_envs.stepping.normal_forms import lifted
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
 
@@ -152,23 +153,21 @@ class Reverse:
     def _parameters_of(self, k: Any) -> list:
         return [getattr(k, f"self_{name}") for name in self._parameters]
 
-    def _lifted(self, xp: Any, y: list) -> list:
-        angle = None if self._form is None else self._form.angle
-        return y if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
-
     def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list[list]:
         top = self._formulas.largest
-        return [self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], self._lifted(xp, y), g, k)]
+        return [
+            self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], lifted(self._form, y, xp), g, k)
+        ]
 
     def _reward_of(self, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> Any:
-        given = self._lifted(xp, y), self._lifted(xp, z), u, g, k
+        given = lifted(self._form, y, xp), lifted(self._form, z, xp), u, g, k
         if not self._formulas.has_last:
             return self._formulas.reward(xp, *given)
         reward, ended = self._formulas.outcome(xp, *given)
         return xp.where(ended, self._formulas.last(xp, *given), reward)
 
     def _observe_of(self, xp: Any, k: Any, y: list, g: list) -> list[list]:
-        return [self._formulas.observe(xp, self._lifted(xp, y), g, k)]
+        return [self._formulas.observe(xp, lifted(self._form, y, xp), g, k)]
 
     def _after_of(
         self, kicked: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list, e: list, **seeds: list

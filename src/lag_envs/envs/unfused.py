@@ -294,14 +294,8 @@ class UnfusedProgram:
 
     def _start(self, t: Script) -> None:
         formulas, n = self._formulas, self.states
-
-        def start(xp: Any, draws: Sequence, k: Any) -> list:
-            numbers = vars(k)
-            state = [numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(n)]
-            return state + formulas.sample_targets(draws[n:], numbers)
-
         draws = self._read(t, slice(0, n + formulas.targets), "d")
-        found = self._run(t, start, draws)
+        found = self._run(t, lambda xp, draws, k: formulas.sample_start(draws, vars(k)), draws)
         self._write_state(t, found[:n])
         self._write(t, self.rows.g, found[n:])
         for rows in (self.rows.u, self.rows.turned, slice(self.rows.reward, self.size)):

@@ -271,6 +271,12 @@ class NormalForm:
         return _stepper(self, self.flow(dt), absent)
 
 
+def lifted(form: NormalForm | None, y: Any, xp: Any) -> list:
+    """Return a state's entries, followed by cosine and sine of the angle if the scene's form has one."""
+    angle = None if form is None else form.angle
+    return [*y] if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
+
+
 @cache
 def _stepper(form: NormalForm, flow: Flow, absent: frozenset[str]) -> Stepper:
     return Stepper(form, flow, absent)

@@ -428,11 +428,14 @@ class TaskFormulas:
             wanted += "; take an entry by its name, as in control.NAME or after.NAME"
         raise FormulaError(f"{type(self._task).__name__}.{name} returns {got}; it must return {wanted}")
 
-    def sample_targets(self, draws: Sequence, k: Any) -> list:
-        """Return targets from draws in [0, 1)."""
+    def sample_start(self, draws: Sequence, k: Any) -> list:
+        """Return the entries of a state and the targets at an episode's start, from draws in [0, 1)."""
+        n = len(self.state)
+        state = [k[f"centre{i}"] + k[f"half{i}"] * (2.0 * d - 1.0) for i, d in enumerate(draws[:n])]
         if self._task.fixed_target is not None:
-            return [k[f"goal{i}"] for i in range(self.targets)]
-        return [t.centre + t.half * (2.0 * d - 1.0) for t, d in zip(self.target_boxes, draws, strict=True)]
+            return state + [k[f"goal{i}"] for i in range(self.targets)]
+        drawn = zip(self.target_boxes, draws[n:], strict=True)
+        return state + [t.centre + t.half * (2.0 * d - 1.0) for t, d in drawn]
 
     def lift(self, y: str) -> list[str]:
         """Return the lines that complete the lifted state."""
