@@ -3,8 +3,10 @@
 The exact ends are those of the report, from the oracle; ``test_oracle.py`` shows why they are right.
 """
 
+from collections.abc import Callable
 from fractions import Fraction
 from math import hypot, inf, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from mpmath import mp, mpf
@@ -157,7 +159,7 @@ class _Draw:
         return options[self.rng.integers(len(options))]
 
 
-def random_cases(kind, n, seed, variants=VARIANTS):
+def random_cases(kind, n, seed):
     """Return random one-step problems for every scene and kind of control in turn.
 
     Parameters
@@ -173,7 +175,6 @@ def random_cases(kind, n, seed, variants=VARIANTS):
         1e5 rad if the solution is an elliptic function.
     n : int
     seed : int
-    variants : sequence of (scene name, control kind)
 
     Returns
     -------
@@ -183,7 +184,7 @@ def random_cases(kind, n, seed, variants=VARIANTS):
     """
     draw = _Draw(np.random.default_rng(seed))
     make = {"task": _task_case, "damped": _body_case, "stiff": _body_case, "extreme": _extreme_case}
-    return [make[kind](kind, *variants[i % len(variants)], draw) for i in range(n)]
+    return [make[kind](kind, *VARIANTS[i % len(VARIANTS)], draw) for i in range(n)]
 
 
 def _case(scene, kind, params, state, control, dt, label):
@@ -238,7 +239,7 @@ def _inertia_of_drag(scene, params):
 
 
 def _body_case(label, scene, kind, draw, edit=None):
-    """Return a case with a random body; edit may change params, state and drive beforehand."""
+    """Return a case with a random body, changed as `edit` says."""
     dt = draw.log(1e-6, 1) if edit else draw.log(1e-3, 0.1)
     if label == "extreme":
         damping_dt = draw.choice(0.0, draw.log(1e-3, 100))
@@ -270,7 +271,10 @@ def _body_case(label, scene, kind, draw, edit=None):
                 state += [draw.within(6)]
     params["gravity"] = GRAVITY
     if edit:
-        state, drive = edit(params, state, drive)
+        params |= edit.params(params)
+        for place, value in edit.state(params).items():
+            state[place] = value
+        drive = drive if edit.drive is None else edit.drive
     drag = damping_dt / dt * _inertia_of_drag(scene, params)
     control = drive
     params["damping"] = drag
@@ -280,74 +284,60 @@ def _body_case(label, scene, kind, draw, edit=None):
     return _case(scene, kind, params, state, control, dt, label)
 
 
+class _Edit(NamedTuple):
+    """What is extreme in a case: parameters and entries of the state, from the parameters, and the drive."""
+
+    params: Callable = lambda p: {}
+    state: Callable = lambda p: {}
+    drive: float | None = None
+
+
 def _extreme_case(label, scene, kind, draw):
-    def set_params(**changes):
-        return lambda params, state, drive: params.update(changes) or (state, drive)
+    def with_radius(p, radius):
+        return {"radius": radius, "inertia": p["mass"] * radius**2 / 2}
 
-    def set_inertia(kappa):
-        def edit(params, state, drive):
-            params["inertia"] = kappa * params["mass"] * params["radius"] ** 2
-            return state, drive
+    def upright(p):
+        return {angle: sign * pi}
 
-        return edit
-
-    def set_radius(of):
-        def edit(params, state, drive):
-            params["radius"] = of(params)
-            params["inertia"] = params["mass"] * params["radius"] ** 2 / 2
-            return state, drive
-
-        return edit
-
-    def set_state(place, value):
-        def edit(params, state, drive):
-            state[place] = value
-            return state, drive
-
-        return edit
-
-    def set_drive(value):
-        return lambda params, state, drive: (state, value)
-
-    def short_bar(params, state, drive):
-        params |= {"com_distance": 1e-8, "inertia": params["mass"] * 1e-16 / 3}
-        return state, drive
-
-    def separatrix(params, state, drive):
+    def separatrix(p):
         if scene == "PivotedBar":
-            arm = params["com_distance"]
-            alpha = params["mass"] * arm * GRAVITY / _inertia_of_drag(scene, params)
+            alpha = p["mass"] * p["com_distance"] * GRAVITY / _inertia_of_drag(scene, p)
         else:
-            arm = params["shell_radius"] - params["radius"]
-            kappa = params["inertia"] / (params["mass"] * params["radius"] ** 2)
-            alpha = GRAVITY / arm / (1 + kappa)
-        state[angle : angle + 2] = 0.0, sign * 2 * sqrt(alpha) * (1 + draw.choice(-1, 1) * 1e-15)
-        return state, 0.0
+            kappa = p["inertia"] / (p["mass"] * p["radius"] ** 2)
+            alpha = GRAVITY / (p["shell_radius"] - p["radius"]) / (1 + kappa)
+        return {angle: 0.0, angle + 1: sign * 2 * sqrt(alpha) * (1 + draw.choice(-1, 1) * 1e-15)}
 
     sign = draw.choice(-1.0, 1.0)
     angle = 2 if scene == "PivotedBar" else 0
-    edits = {"no gravity": set_params(gravity=0.0), "strong gravity": set_params(gravity=1e3)}
+    edits = {
+        "no gravity": _Edit(lambda p: {"gravity": 0.0}),
+        "strong gravity": _Edit(lambda p: {"gravity": 1e3}),
+    }
     if scene == "Incline":
-        edits |= {"fast": set_state(1, sign * 1e4), "tiny radius": set_radius(lambda p: 1e-8)}
+        edits |= {
+            "fast": _Edit(state=lambda p: {1: sign * 1e4}),
+            "tiny radius": _Edit(lambda p: with_radius(p, 1e-8)),
+        }
         if kind == "tilt_rate":
             tilt_rates = 0.0, 1e-300, 1e-12, 1e-6, 100.0
-            edits["tilt rate"] = set_drive(sign * draw.choice(*tilt_rates))
+            edits["tilt rate"] = _Edit(drive=sign * draw.choice(*tilt_rates))
     else:
         edits |= {
-            "fast": set_state(angle + 1, sign * 1e4),
-            "upright": set_state(angle, sign * pi),
-            "separatrix": separatrix,
+            "fast": _Edit(state=lambda p: {angle + 1: sign * 1e4}),
+            "upright": _Edit(state=upright),
+            "separatrix": _Edit(state=separatrix, drive=0.0),
         }
         if kind != "damping":
-            edits["strong drive"] = set_drive(sign * 1e6)
+            edits["strong drive"] = _Edit(drive=sign * 1e6)
+    edits["point mass"] = _Edit(lambda p: {"inertia": 0.0})
     if scene == "PivotedBar":
-        edits |= {"point mass": set_params(inertia=0.0), "short bar": short_bar}
-        edits["upright, no drive"] = lambda p, state, drive: set_state(2, sign * pi)(p, state, 0.0)
+        edits["short bar"] = _Edit(lambda p: {"com_distance": 1e-8, "inertia": p["mass"] * 1e-16 / 3})
+        edits["upright, no drive"] = _Edit(state=upright, drive=0.0)
     else:
-        edits |= {"point mass": set_inertia(0.0), "hoop": set_inertia(1.0)}
+        edits["hoop"] = _Edit(lambda p: {"inertia": p["mass"] * p["radius"] ** 2})
     if scene == "CylinderInCylinder":
-        edits["r near 0"] = set_radius(lambda p: 1e-6 * p["shell_radius"])
-        edits["r near R"] = set_radius(lambda p: (1 - 1e-6) * p["shell_radius"])
+        edits["r near 0"] = _Edit(lambda p: with_radius(p, 1e-6 * p["shell_radius"]))
+        edits["r near R"] = _Edit(lambda p: with_radius(p, (1 - 1e-6) * p["shell_radius"]))
     name = draw.choice(*edits)
     case = _body_case(label, scene, kind, draw, edits[name])
     case["label"] = name
