@@ -303,24 +303,6 @@ def test_parameters_reach_the_scene():
     assert env.scene is env.task.scene
 
 
-@each_perfect
-def test_steps_are_those_of_simulate(env_id):
-    env = make(env_id)
-    env.reset(seed=1, options={"state": TASKS[env_id].examples.start["state"]})
-    for action in actions(40, env.action_space):
-        before = env.state
-        _, _, terminated, truncated, _ = env.step(action)
-        after = env.scene.simulate(before, [env.control], env.task.dt)[1]
-        moved = env.state - after
-        if env_id == cylinder_in_cylinder.Damping.id:
-            moved[-1] -= round(moved[-1] / 1.5) * 1.5  # a kick
-        elif env.task.draws:
-            moved[-1] = 0.0
-        np.testing.assert_allclose(moved, 0.0, atol=3e-15)
-        if terminated or truncated:
-            break
-
-
 # --- what a step returns ---
 
 

@@ -186,20 +186,6 @@ def test_max_episode_steps(env_id, mode):
     assert assert_alike(native, sync, 60) >= 12
 
 
-@each_id
-def test_a_sub_environment_is_the_single_one(env_id):
-    native = gym.make_vec(env_id, num_envs=5)
-    native.reset(seed=40)
-    env = make(env_id)
-    env.reset(seed=43)
-    for action in actions(30, native.action_space):
-        mine = native.step(action)
-        alone = env.step(action[3])
-        assert mine[0][3].tobytes() == alone[0].tobytes() and mine[1][3] == alone[1]
-        if alone[2] or alone[3]:
-            break
-
-
 @each_single
 def test_states_and_targets_by_hand(env_id):
     single = make(env_id)

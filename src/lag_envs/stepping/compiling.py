@@ -50,6 +50,12 @@ def record_block(
     return lines, [name if name in named else result for name, result in zip(outputs, results, strict=True)]
 
 
+def block_lines(trace: Trace, outputs: dict[str, Any], *, fused: bool = True) -> list[str]:
+    """Return the code of `record_block`, with outputs that turned out to be constant assigned as well."""
+    lines, values = record_block(trace, outputs, fused=fused)
+    return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
+
+
 def count_operations(lines: Iterable[str], kinds: frozenset[str] | None = None) -> int:
     """Count the operations (of these kinds, or all) of the blocks in these lines of code."""
     blocks = (_blocks[name][0] for line in lines for name in re.findall(_BLOCK, line))

@@ -8,6 +8,7 @@ converted at both ends of the control step.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from lag_envs.mechanics.evaluation import eliminated, exactly
 from lag_envs.mechanics.layout import Prescribed
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter, parameter_values
-from lag_envs.stepping.compiling import absent_from, compile_function, record_block
+from lag_envs.stepping.compiling import absent_from, block_lines, compile_function
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
@@ -477,16 +478,14 @@ class StepCode:
         self._inputs = [f"k_{name}" if name in record.constants else name for name in record.given]
         wanted = [name for name in record.given if name not in record.constants]
 
-        def run(formula: Callable, inputs: Sequence[str]) -> tuple[list[str], list]:
+        def run(formula: Callable, inputs: Sequence[str]) -> list[str]:
             trace = ElementaryTrace()
             numbers = {
                 name: trace.zero() if value == 0.0 else trace.inputs(value)[0]
                 for name, value in given.items()
                 if name.startswith("p_")
             }
-            values = [trace.inputs(name)[0] for name in inputs]
-            results = formula(trace, values, numbers)
-            return record_block(trace, results, fused=fused)
+            return block_lines(trace, formula(trace, trace.inputs(*inputs), numbers), fused=fused)
 
         states, controls = len(self.start), len(self.controls)
 
@@ -501,25 +500,10 @@ class StepCode:
             found = dict(zip(self.end, ends, strict=True))
             return found | dict(zip(self.applied, stepper.followed(xp, given, rest[-1]), strict=True))
 
-        self.prepare, prepared = run(prepare, [*self.start, *self.controls])
-        self.prepare += [
-            f"{name} = {value}"
-            for name, value in zip((*wanted, *q, *v), prepared, strict=True)
-            if name != value
-        ]
-        self.finish, finished = run(finish, [*q, *v, *self.start, *self.controls, "dt"])
-        self.finish += [
-            f"{name} = {value}"
-            for name, value in zip([*self.end, *self.applied], finished, strict=True)
-            if name != value
-        ]
-        used = " ".join([*self.prepare, *self.finish, *self._inputs])
-        self.constants = [
-            value
-            for value in given.values()
-            if isinstance(value, str)
-            and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
-        ]
+        self.prepare = run(prepare, [*self.start, *self.controls])
+        self.finish = run(finish, [*q, *v, *self.start, *self.controls, "dt"])
+        words = set(re.findall(r"\w+", " ".join([*self.prepare, *self.finish, *self._inputs])))
+        self.constants = [value for value in given.values() if value in words]
         #: Rows that must be filled in before the step.
         self.given = [*self._inputs, *q, *v, "status", "span"]
         own = [*self._inputs, *q, *v, "status", "left", "wish", "span"]

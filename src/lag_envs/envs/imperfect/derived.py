@@ -11,7 +11,7 @@ from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import formula as naming
 from lag_envs.mechanics.recording import parameter, parameter_names, parameter_values, twin
 from lag_envs.scenes.derivation import form_of
-from lag_envs.stepping.compiling import record_block
+from lag_envs.stepping.compiling import block_lines, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.lag import lagged_stepper
@@ -80,8 +80,7 @@ class DerivedConstants:
             base, low, high = (trace.inputs(x)[0] if isinstance(x, str) else x for x in given)
             (share,) = trace.inputs(f"share{j}")
             outputs[f"p_{d.name}"] = d.printed(share, base, low, high, trace)
-        code, values = record_block(trace, outputs, fused=False)
-        code += [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
+        code = block_lines(trace, outputs, fused=False)
         # Derived parameters are computed as Python does it: one rounding for each operation.
         trace = ElementaryTrace()
         numbers = self._given(trace, constants)
@@ -94,10 +93,7 @@ class DerivedConstants:
         numbers = self._given(trace, constants) | {n: trace.inputs(f"p_{n}")[0] for n in self._parameters}
         found = self._task.formulas.starts_of(numbers) | {f"self_{n}": x for n, x in numbers.items()}
         found |= self._motion(trace, numbers, self._parameters)
-        results = {f"k_{name}": found[name] for name in self.changed}
-        last, values = record_block(trace, results)
-        rename = [f"{n} = {v}" for n, v in zip(results, values, strict=True) if n != v]
-        return [*code, *last, *rename]
+        return [*code, *block_lines(trace, {f"k_{name}": found[name] for name in self.changed})]
 
     def _given(self, trace: Any, constants: dict[str, Any]) -> dict[str, Any]:
         """Return all parameters as inputs, but zeros as zero."""
