@@ -247,12 +247,12 @@ def _always(flow: Flow, fast: Callable, order: int) -> Flow:
     variables = [f"y{i}" for i in range(flow.size)]
     arguments = ", ".join([*variables, *fields, "dt"])
 
-    def compile(present: tuple[bool, ...]) -> Callable:
+    def compile(absent: frozenset[str]) -> Callable:
         step = compile_traced(
             "step",
             arguments,
             lambda xp, *a: fast(a[: flow.size], flow.coefficients(*a[flow.size : -1]), a[-1], xp),
-            frozenset(name for name, there in zip(fields, present, strict=True) if not there),
+            absent,
         )
         ends = ", ".join(variables)
         source = f"def flow({arguments}, x):\n    {ends} = step({arguments})\n    return {ends}, 1\n"
