@@ -91,7 +91,7 @@ def best_settings(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str,
 def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content: times at equal errors, equality of models, certificates, first steps, energy."""
     found = best_settings(rows)
-    missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
+    absent = missing(rows)
     fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
     claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
     pictures = [
@@ -105,7 +105,7 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
         for name in SYSTEMS
         if any(r["kind"] == "point" and r["system"] == name for r in rows)
     ]
-    tables = [best_times(found, mode) for mode in MODES]
+    tables = [best_times("general", found, mode) for mode in MODES]
     tables += [_models(rows), _shares(rows), _first(rows), _energy(rows)]
     return Content(
         "Any Lagrangian",
@@ -126,15 +126,20 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
             "algorithm in RK4 steps in a C++ loop. For both, a driven support is a field in its frame. RK4, "
             "DOP853 and Radau IIA take fixed steps and are compiled like lag_envs.",
-            *([f"Not compared: {', '.join(missing)}."] if missing else []),
+            *([f"Not compared: {absent}."] if absent else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
         [t for t in tables if t.rows],
         pictures,
         claims,
         summary=_summary(found),
-        details=[all_points(rows)],
+        details=[all_points("general-points", rows)],
     )
+
+
+def missing(rows: Sequence[Row]) -> str:
+    """Return the libraries that are not installed."""
+    return ", ".join(sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")}))
 
 
 def file_part(name: str) -> str:
@@ -171,7 +176,7 @@ def _others(here: Mapping[str, BestSetting]) -> list[tuple[float, str]]:
     return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
 
 
-def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
+def best_times(section: str, found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
     """Return the quickest setting of each column, by system and error."""
     rows = []
     for (system, of, target), here in found.items():
@@ -184,7 +189,7 @@ def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> T
             ratio, f"{others[0][1]}: {here[others[0][1]].label}" if others else None,
         ))  # fmt: skip
     return Table(
-        f"general-times-{mode}",
+        f"{section}-times-{mode}",
         f"CPU time of a control step [ns] {MODES[mode]}, each at its quickest setting whose worst error is "
         "below the one given; the ratio is that of the quickest other to lag_envs, below 1 where the other "
         "is faster",
@@ -232,8 +237,9 @@ def _equal(rows: Sequence[Row]) -> Claim:
 
 
 def _accurate(rows: Sequence[Row]) -> Claim:
-    shipped = TOLERANCE, CertifiedSeries.method_of(usual_order(DT))
-    found = [r for r in rows if r["kind"] == "point" and (r["setting"], r["method"]) == shipped]
+    shipped = CertifiedSeries(usual_order(DT), TOLERANCE)
+    key = shipped.method, shipped.setting
+    found = [r for r in rows if r["kind"] == "point" and (r["method"], r["setting"]) == key]
     worst = max((math.inf if r["error"] is None else r["error"] for r in found), default=0.0)
     return Claim(
         "At the shipped tolerance and order, a step from a harsh state errs by less than 1e-12.",
@@ -272,16 +278,17 @@ def _conserved(rows: Sequence[Row]) -> Claim:
 
 
 def _models(rows: Sequence[Row]) -> Table:
-    return Table(
+    return Table.of(
         "general-models",
         "Other engines' models against Lagrange's equations by SymPy, at 50 random states: largest "
         "differences, relative",
-        ("system", "engine", "mass matrix", "acceleration"),
-        [
-            (r["system"], LABELS[r["engine"]], r.get("mass", r.get("problem")), r.get("acceleration"))
-            for r in rows
-            if r["kind"] == "model"
-        ],
+        {
+            "system": "system",
+            "engine": lambda r: LABELS[r["engine"]],
+            "mass matrix": lambda r: r.get("mass", r.get("problem")),
+            "acceleration": lambda r: r.get("acceleration"),
+        },
+        [r for r in rows if r["kind"] == "model"],
     )
 
 
@@ -320,28 +327,24 @@ def _first(rows: Sequence[Row]) -> Table:
 
 
 def _energy(rows: Sequence[Row]) -> Table:
-    return Table(
+    return Table.of(
         "general-energy",
         "Energy of undamped double pendulums: largest drift, relative to its height above the lowest "
         "energy; lag_envs over the whole time, the others at the end",
-        ("method", "seconds", "drift"),
-        [
-            (r["method"], r["seconds"], "lost" if r["drift"] is None else r["drift"])
-            for r in rows
-            if r["kind"] == "energy"
-        ],
+        {
+            "method": "method",
+            "seconds": "seconds",
+            "drift": lambda r: "lost" if r["drift"] is None else r["drift"],
+        },
+        [r for r in rows if r["kind"] == "energy"],
     )
 
 
-def all_points(rows: Sequence[Row]) -> Table:
+def all_points(name: str, rows: Sequence[Row]) -> Table:
     """Return every setting of every method."""
     names = ("system", "mode", "family", "method", "setting", "error", "median", "ns", "clock", "problem")
-    return Table(
-        "general-points",
-        "All points",
-        names,
-        [[r.get(name) for name in names] for r in rows if r["kind"] == "point"],
-    )
+    points = [r for r in rows if r["kind"] == "point"]
+    return Table(name, "All points", names, [[r.get(entry) for entry in names] for r in points])
 
 
 #: Colours after Okabe and Ito.
