@@ -22,7 +22,6 @@ from lag_envs.report.episodes import (
     DIGITS,
     RecordedEpisode,
     endless_actions,
-    entry_errors,
     episode_errors,
     exact_states,
     exact_stepping,
@@ -103,7 +102,11 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
 
     path, step = exact(episode.states[0]), exact_stepping(task, seed, DIGITS)
     alone = [step(y, i, u) for i, (y, u) in enumerate(zip(episode.states, episode.controls, strict=False), 1)]
-    row = episode_errors(episode, path, exact(moved_start(episode.states), DIGITS - 10), alone, task.dt)
+    shifted = exact(moved_start(episode.states), DIGITS - 10)
+    entries = list(zip(task.scene.state_names, task.scene.state_units, strict=True))
+    row = episode_errors(episode, path, shifted, alone, task.dt, entries)
+    order = order_of(task.scene, task.dt)
+    row |= {"own": True, "integrator": f"Taylor series, order {order}" if order else "exact flow"}
     if vouch:
         row["disagreement"] = float(
             max(
@@ -112,12 +115,6 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
                 for a, b in zip(x, y, strict=True)
             )
         )
-    order = order_of(task.scene, task.dt)
-    row |= {
-        "own": True,
-        "integrator": f"Taylor series, order {order}" if order else "exact flow",
-        "entries": entry_errors(row.pop("each"), task.scene.state_names, task.scene.state_units),
-    }
     return row
 
 

@@ -111,11 +111,13 @@ def episode_errors(
     shifted: list[list[mpf]],
     alone: list[list[mpf]],
     dt: float,
+    entries: Sequence[tuple[str, str]],
     wraps: Sequence[int] = (),
 ) -> Row:
-    """Return errors and amplified rounding, each the largest up to a time, relative to the states' sizes.
+    """Return errors and amplified rounding, each the largest up to a time.
 
-    "one step" is the largest error of any single step of the episode.
+    They are relative to the states' sizes, but those of the "entries" in their units. "one step" is the
+    largest error of any single step of the episode.
 
     Parameters
     ----------
@@ -127,6 +129,8 @@ def episode_errors(
         For each step, the exact state at its end, from the recorded state at its start.
     dt : float
         Control step [s].
+    entries : sequence of (str, str)
+        Names and units of the state's entries.
     wraps : sequence of int
         Entries that the environment wraps into [-π, π].
     """
@@ -149,8 +153,8 @@ def episode_errors(
     steps = len(episode.controls)
     marks = {**{f"{t:g} s": round(t / dt) for t in TIMES}, "the end": steps}
 
-    def pairs(values: Array) -> list[list[float]]:
-        return [[float(a), float(s)] for a, s in zip(values, scale, strict=True)]
+    def marked(values: Array) -> dict[str, float | None]:
+        return {name: float(values[i]) if i <= steps else None for name, i in marks.items()}
 
     points = np.unique(np.geomspace(1, steps, POINTS).round().astype(int))
     return {
@@ -158,19 +162,11 @@ def episode_errors(
         "steps": steps,
         "seconds": steps * dt,
         "terminated": episode.terminated,
-        "error": {"one step": float((one / scale).max())}
-        | {name: float(error[i]) if i <= steps else None for name, i in marks.items()},
-        "amplified": {name: float(amplified[i]) if i <= steps else None for name, i in marks.items()},
+        "error": {"one step": float((one / scale).max()), **marked(error)},
+        "amplified": marked(amplified),
         "curve": [[float(i * dt), float(error[i]), float(amplified[i])] for i in points],
-        "each": {"one step": pairs(one)}
-        | {name: pairs(up_to[i]) if i <= steps else None for name, i in marks.items()},
+        "entries": [
+            {"name": name, "unit": unit, "size": float(size), "one step": float(step), **marked(each)}
+            for (name, unit), size, step, each in zip(entries, scale, one, up_to.T, strict=True)
+        ],
     }
-
-
-def entry_errors(each: dict[str, Any], names: Sequence[str], units: Sequence[str]) -> list[Row]:
-    """Return for each state entry its name, unit, size, and the error up to each mark in that unit."""
-    return [
-        {"name": name, "unit": unit, "size": each["the end"][i][1]}
-        | {mark: values and values[i][0] for mark, values in each.items()}
-        for i, (name, unit) in enumerate(zip(names, units, strict=True))
-    ]

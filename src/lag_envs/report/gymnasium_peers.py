@@ -13,14 +13,7 @@ import gymnasium as gym
 import numpy as np
 from mpmath import mpf
 
-from lag_envs.report.episodes import (
-    DIGITS,
-    RecordedEpisode,
-    endless_actions,
-    entry_errors,
-    episode_errors,
-    moved_start,
-)
+from lag_envs.report.episodes import DIGITS, RecordedEpisode, endless_actions, episode_errors, moved_start
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Row
 from lag_envs.scenes import Acrobot, CartPole, Pendulum
@@ -38,10 +31,10 @@ class GymnasiumPeer(NamedTuple):
     wraps: Sequence[int] = ()
     limits: Callable[[Any], Sequence[float]] = lambda env: ()  #: at these speeds it clips the last entries
 
-    def described(self, env: Any) -> tuple[list[str], list[str]]:
+    def entries(self, env: Any) -> list[tuple[str, str]]:
         """Return names and units of its state."""
-        scene, own = self.scene(env), np.argsort(self.order)
-        return [scene.state_names[i] for i in own], [scene.state_units[i] for i in own]
+        scene = self.scene(env)
+        return [(scene.state_names[i], scene.state_units[i]) for i in np.argsort(self.order)]
 
 
 PEERS = {
@@ -114,12 +107,8 @@ def measure_peer(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row
     alone = [
         solve_peer(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)
     ]
-    row = episode_errors(episode, path, shifted, alone, dt, peer.wraps)
-    return row | {
-        "own": False,
-        "integrator": peer.integrator,
-        "entries": entry_errors(row.pop("each"), *peer.described(env)),
-    }
+    row = episode_errors(episode, path, shifted, alone, dt, peer.entries(env), peer.wraps)
+    return row | {"own": False, "integrator": peer.integrator}
 
 
 def solve_peer(
@@ -127,7 +116,7 @@ def solve_peer(
 ) -> list[list[mpf]]:
     """Return the exact states of a peer's equations of motion, each control held for one step."""
     oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
-    path = [[x if isinstance(x, mpf) else mpf(float(x)) for x in (start[i] for i in peer.order)]]
+    path = [[start[i] for i in peer.order]]
     for u in controls:
         path.append(oracle.once(path[-1], u, peer.step(env), DIGITS))
     return [[y[i] for i in own] for y in path]
