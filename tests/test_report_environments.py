@@ -81,6 +81,12 @@ def test_peers_equations_are_those_of_their_code(id):
         np.testing.assert_allclose(step, after, rtol=0, atol=1e-12)
 
 
+def solve_peer(env, peer, episode):
+    """Return the exact states under an episode's controls."""
+    step = gymnasium_peers.exact_peer_step(env, peer)
+    return episodes.chained(step, episode.states[0], episode.controls)
+
+
 @pytest.mark.parametrize("id", gymnasium_peers.PEERS)
 @pytest.mark.filterwarnings("ignore")
 def test_peers_exact_states_agree_with_dop853(id):
@@ -92,14 +98,14 @@ def test_peers_exact_states_agree_with_dop853(id):
         y = integrate.solve_ivp(
             lambda t, y, f=rates: f(y), (0, peer.step(env)), y, "DOP853", rtol=1e-13, atol=1e-13
         ).y[:, -1]
-    exact = gymnasium_peers.solve_peer(env, peer, episode.states[0], episode.controls)[-1]
+    exact = solve_peer(env, peer, episode)[-1]
     np.testing.assert_allclose(np.array(exact, dtype=float), y, rtol=0, atol=1e-11)
 
 
 def test_exact_states_are_those_of_equations_that_are_typed_in():
     """Pendulum-v1 and the bar as driven pendulums, with coefficients by hand in exact fractions."""
     env, peer, episode = short_episode("Pendulum-v1")
-    path = gymnasium_peers.solve_peer(env, peer, episode.states[0], episode.controls)
+    path = solve_peer(env, peer, episode)
     given = [({"alpha": -15, "delta": 3 * Fraction(u)}, env.dt) for u in episode.controls]
     same(path, episode.states[0], given)
 

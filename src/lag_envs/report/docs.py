@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.options import module_parser
 from lag_envs.report import overview, page
-from lag_envs.report.content import ReportFigure, Table
+from lag_envs.report.content import ReportFigure
 from lag_envs.report.report import FILE, content_of
 from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
@@ -324,11 +324,8 @@ def _anchor(title: str) -> str:
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
-def _table(table: dict[str, Any] | Table) -> str:
-    parts = vars(table) if isinstance(table, Table) else table
-    return markdown_table(
-        parts["columns"], [[page.cell_text(value) for value in row] for row in parts["rows"]]
-    )
+def _table(table: dict[str, Any]) -> str:
+    return markdown_table(table["columns"], [list(map(page.cell_text, row)) for row in table["rows"]])
 
 
 if __name__ == "__main__":

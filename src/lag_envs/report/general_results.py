@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
+from lag_envs.report.diagrams import labelled_lines
 from lag_envs.report.linkages import SYSTEMS
 from lag_envs.report.motions import CertifiedSeries
 from lag_envs.report.points import MODES, TARGETS
@@ -392,10 +393,8 @@ def draw_times(name: str, rows: Sequence[Row]) -> Figure:
                     label=title,
                 )
     figure.axes[0].set_ylabel("worst error, relative")
-    handles = {
-        text: line for ax in figure.axes for line, text in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
+    lines = labelled_lines(figure.axes)
     figure.legend(
-        list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False
+        list(lines.values()), list(lines), loc="outside lower center", ncols=7, fontsize=8, frameon=False
     )
     return figure

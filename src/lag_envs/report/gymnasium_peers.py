@@ -13,7 +13,15 @@ import gymnasium as gym
 import numpy as np
 from mpmath import mpf
 
-from lag_envs.report.episodes import DIGITS, RecordedEpisode, endless_actions, episode_errors, moved_start
+from lag_envs.report.episodes import (
+    DIGITS,
+    ExactStep,
+    RecordedEpisode,
+    chained,
+    endless_actions,
+    episode_errors,
+    moved_start,
+)
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Row
 from lag_envs.scenes import Acrobot, CartPole, Pendulum
@@ -101,22 +109,20 @@ def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[An
 
 def measure_peer(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row:
     """Return the row of a peer's episode against the exact one."""
-    dt = peer.step(env)
-    path = solve_peer(env, peer, episode.states[0], episode.controls)
-    shifted = solve_peer(env, peer, moved_start(episode.states), episode.controls)
-    alone = [
-        solve_peer(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)
-    ]
-    row = episode_errors(episode, path, shifted, alone, dt, peer.entries(env), peer.wraps)
+    step = exact_peer_step(env, peer)
+    path, shifted = (
+        chained(step, start, episode.controls) for start in (episode.states[0], moved_start(episode.states))
+    )
+    row = episode_errors(episode, step, path, shifted, peer.step(env), peer.entries(env), peer.wraps)
     return row | {"own": False, "integrator": peer.integrator}
 
 
-def solve_peer(
-    env: Any, peer: GymnasiumPeer, start: Sequence[Any], controls: Sequence[float]
-) -> list[list[mpf]]:
-    """Return the exact states of a peer's equations of motion, each control held for one step."""
-    oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
-    path = [[start[i] for i in peer.order]]
-    for u in controls:
-        path.append(oracle.once(path[-1], u, peer.step(env), DIGITS))
-    return [[y[i] for i in own] for y in path]
+def exact_peer_step(env: Any, peer: GymnasiumPeer) -> ExactStep:
+    """Return the exact step of a peer's equations of motion."""
+    oracle, own, dt = oracle_of(peer.scene(env)), np.argsort(peer.order), peer.step(env)
+
+    def step(state: Sequence[Any], number: int, control: float) -> list[mpf]:
+        end = oracle.once([state[i] for i in peer.order], control, dt, DIGITS)
+        return [end[i] for i in own]
+
+    return step

@@ -417,22 +417,20 @@ class Torchdiffeq(LibraryRival):
 
 # --- MuJoCo ---
 
-#: Models by scene, in the frame of the prescribed motion: its acceleration tilts gravity. Contacts and
-#: constraints, of which there are none, are switched off.
-MODELS: dict[type[Scene], str] = {
-    PivotedBar: """
-    <mujoco>
-      <option gravity="{minus_control!r} 0 {minus_gravity!r}" integrator="{integrator}" timestep="{step!r}">
-        <flag contact="disable" constraint="disable"/>
-      </option>
-      <worldbody><body>
-        <joint type="hinge" axis="0 -1 0" damping="{scene.damping!r}"/>
-        <inertial pos="0 0 -{scene.com_distance!r}" mass="{scene.mass!r}"
-                  diaginertia="{scene.inertia!r} {scene.inertia!r} {scene.inertia!r}"/>
-      </body></worldbody>
-    </mujoco>
-    """
-}
+#: The bar in the frame of its support, whose acceleration tilts gravity. Contacts and constraints, of which
+#: there are none, are switched off.
+BAR = """
+<mujoco>
+  <option gravity="{minus_control!r} 0 {minus_gravity!r}" integrator="{integrator}" timestep="{step!r}">
+    <flag contact="disable" constraint="disable"/>
+  </option>
+  <worldbody><body>
+    <joint type="hinge" axis="0 -1 0" damping="{scene.damping!r}"/>
+    <inertial pos="0 0 -{scene.com_distance!r}" mass="{scene.mass!r}"
+              diaginertia="{scene.inertia!r} {scene.inertia!r} {scene.inertia!r}"/>
+  </body></worldbody>
+</mujoco>
+"""
 
 
 class MuJoCo(LibraryRival):
@@ -441,27 +439,25 @@ class MuJoCo(LibraryRival):
     family = "mujoco"
     settings: ClassVar = {"Euler": SUBSTEPS, "implicitfast": SUBSTEPS, "RK4": SUBSTEPS}
     stepped = ("Euler", "implicitfast", "RK4")
+    batched = False  # a rollout takes one state after the other
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
         """Return whether there is a model of the scene."""
-        return any(kind in MODELS for kind in type(scene).__mro__)
-
-    batched = False  # a rollout takes one state after the other
+        return isinstance(scene, PivotedBar)
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make a model of every problem."""
-        kind = type(problems.cases[0].scene)
-        model = next((MODELS[base] for base in kind.__mro__ if base in MODELS), None)
-        if model is None:
-            raise ValueError(f"there is no MuJoCo model of {kind.__name__}")
+        scene = problems.cases[0].scene
+        if not self.solves(scene):
+            raise ValueError(f"there is no MuJoCo model of {type(scene).__name__}")
         import mujoco
         from mujoco.rollout import rollout
 
         n = self.substeps(steps)
         models = [
             mujoco.MjModel.from_xml_string(
-                model.format(
+                BAR.format(
                     scene=scene, minus_control=-control, minus_gravity=-scene.gravity,  # type: ignore[attr-defined]
                     integrator=self.method, step=dt * steps / n,
                 )

@@ -16,14 +16,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import lag_envs
 from lag_envs import store
-from lag_envs.host import machine
+from lag_envs.host import installed_versions, machine
 from lag_envs.progress import progress
 from lag_envs.workers import as_they_finish, died, processes
 
@@ -80,13 +79,8 @@ def fingerprint() -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and packages."""
-    found = {"lag_envs": lag_envs.__version__}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    absent = dict.fromkeys(LIBRARIES, "not installed")
+    return {"lag_envs": lag_envs.__version__} | absent | installed_versions(LIBRARIES)
 
 
 def run_jobs(
