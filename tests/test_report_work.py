@@ -18,7 +18,6 @@ from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
 from lag_envs.report.points import LAG_ENVS, MODES, TARGETS, WorkPrecisionPoint
 from lag_envs.report.rivals import CompiledMethod, ShippedStepping
-from lag_envs.report.runner import JobResult
 from lag_envs.report.timing import FlowSteps
 from lag_envs.report.work_precision import OrderedMethod
 from lag_envs.scenes.derivation import form_of
@@ -481,14 +480,6 @@ def test_errors_below_amplified_rounding_are_none():
     assert claimed(rows).holds is True
     floor = {"kind": "rounding", "variant": "PivotedBar", "horizon": "one step", "amplified": 1e-12}
     assert claimed([*rows, floor]).holds is False
-
-
-def test_a_lost_job_is_a_row_and_claims_nothing():
-    """Without rows every claim is open; the problem is stated."""
-    lost = JobResult("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
-    content = work_precision.content([], [lost])
-    assert all(claim.holds is None for claim in content.claims)
-    assert any("stopped after 120 s" in row for table in content.tables for row in table.rows)
 
 
 def test_the_picture_has_the_fastest_form_of_each():

@@ -17,7 +17,7 @@ from lag_envs.mechanics.recording import control, parameter, parameter_values
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.oracle import oracle_of, solve_positive
 from lag_envs.report.rivals import Rival
-from lag_envs.report.timing import BLOCK, Sample
+from lag_envs.report.timing import BLOCK, Sample, blocks, unblocked
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.stepping.compiling import compile_function
@@ -186,15 +186,8 @@ class CertifiedSeries(Rival):
 
             return Sample(run, count, ends=ends.copy)
         batch = _batch(code, self.setting)
-        blocks = -(-count // BLOCK)
-        rows = width + controls.shape[1] + len(code.rows) + 1
-        memory = np.zeros((blocks, rows, BLOCK))
-        begin = np.zeros((blocks, width + controls.shape[1], BLOCK))
-        flat = np.concatenate([starts, controls], axis=1).T
-        for i in range(blocks):
-            part = flat[:, i * BLOCK : (i + 1) * BLOCK]
-            begin[i, :, : part.shape[1]] = part
-            begin[i, :, part.shape[1] :] = part[:, :1]
+        begin = blocks(np.concatenate([starts, controls], axis=1).T, BLOCK)
+        memory = np.zeros((len(begin), begin.shape[1] + len(code.rows) + 1, BLOCK))
 
         def prepare() -> None:
             memory[:, : begin.shape[1]] = begin
@@ -203,12 +196,7 @@ class CertifiedSeries(Rival):
             if batch(memory.reshape(-1), count, dt, order, *numbers):
                 raise ArithmeticError("a step was refused")
 
-        return Sample(
-            together_run,
-            count,
-            prepare,
-            lambda: memory[:, :width].transpose(0, 2, 1).reshape(-1, width)[:count].copy(),
-        )
+        return Sample(together_run, count, prepare, lambda: unblocked(memory[:, :width], count).T.copy())
 
 
 @cache

@@ -16,8 +16,8 @@ import numpy as np
 
 from lag_envs.report.arithmetic import Arithmetic
 from lag_envs.report.equations import Array, Equation, Problems
-from lag_envs.report.rivals import Rival, blocks, unblocked
-from lag_envs.report.timing import Sample
+from lag_envs.report.rivals import Rival
+from lag_envs.report.timing import Sample, blocks, unblocked
 from lag_envs.scenes import PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block

@@ -5,8 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import form_of, motion_constants_of
@@ -29,12 +28,9 @@ class Stepped:
 
     Examples
     --------
-    >>> from lag_envs.report.integrators import comparison
     >>> from lag_envs.scenes import PivotedBar
-    >>> bar = PivotedBar(track=None)
-    >>> rk4 = Stepped(bar, comparison("RK4", Stepped(bar).flow))
-    >>> rk4.simulate([2.0, 0.0], [0.0] * 4, 0.005)[-1].round(6).tolist()
-    [1.995538, -0.446313]
+    >>> [float(x) for x in Stepped(PivotedBar(track=None)).lift([0.0, 3.0])]
+    [0.0, 3.0, 1.0, 0.0]
     """
 
     def __init__(self, scene: Scene, flow: Flow | None = None, dt: float = 0.02) -> None:
@@ -80,13 +76,3 @@ class Stepped:
     def present(self) -> list[float]:
         """Return the constants of the code."""
         return [value for value in self.constants().values() if value != 0.0]
-
-    def simulate(self, state: ArrayLike, controls: ArrayLike, dt: float) -> NDArray[np.float64]:
-        """Step like `Scene.simulate`; rows after a refused step are NaN."""
-        given = np.asarray(controls, np.float64)
-        trajectory = np.full((len(given) + 1, self.width - (2 if self.angle is not None else 0)), np.nan)
-        trajectory[0] = state
-        self.stepper().compile_simulate()(
-            trajectory, given[:, None], dt, self.largest_majorant(dt), *self.present()
-        )
-        return trajectory
