@@ -433,12 +433,6 @@ def made(library, id, kind, num_envs, rates):
     return Contestant(library, id, kind, num_envs, lambda: None, rates)
 
 
-def test_ratios_are_taken_within_a_round():
-    # The machine is ten times slower in the second round: the ratio of medians would be 2.5.
-    assert ratios([40.0, 4.0, 50.0], [20.0, 2.0, 10.0]) == [2.0, 2.0, 5.0]
-    assert quartiles([2.0, 2.0, 5.0])[1] == 2.0
-
-
 def test_rows_are_compared_with_cartpole_of_their_size():
     rows = [
         made("gymnasium", "CartPole-v1", "made", 1, [10.0, 10.0]),

@@ -6,6 +6,7 @@ import re
 import sys
 from fractions import Fraction
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -250,7 +251,7 @@ def test_a_scene_of_ones_own():
 
     exact = 1e-6 * np.cos(np.sqrt(Some.p[0]) * 0.4)
     found = [CompiledMethod("RK4", 8), CompiledMethod("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
-    for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if _has("heyoka") else []):
+    for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if find_spec("heyoka") else []):
         for together in (False, True):
             ends = rival.build(Some(), 0.1, 4, together).end()
             assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
@@ -262,14 +263,6 @@ def test_a_scene_of_ones_own():
     with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
         CompiledMethod("ETD4RK", 1).build(Some(), 0.1, 4, False)
     assert "Verlet" in CompiledMethod.methods(Problems(ensemble("PivotedBar", 1)).equation)
-
-
-def _has(package):
-    try:
-        __import__(package)
-    except ImportError:
-        return False
-    return True
 
 
 def test_a_missing_library_is_a_row(monkeypatch):

@@ -64,16 +64,11 @@ def jobs(quick: bool) -> list[ReportJob]:
         for id in PEERS
         for seed in (seeds[:3] if id == "Acrobot-v1" else seeds)  # its episodes last 100 s
     ]
-    free: list[dict[str, Any]] = [{"id": id} for id in ("", *UNDRIVEN)]
+    free: dict[str, dict[str, Any]] = {"lag_envs, undriven": {"id": ""}}
     if not quick:
-        free.insert(1, {"id": "", "dt": 0.02})
-    names = [
-        f"{f['id'] or 'lag_envs'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free
-    ]
-    return made + [
-        ReportJob(SECTION, name, "environments:undriven", arguments)
-        for name, arguments in zip(names, free, strict=True)
-    ]
+        free["lag_envs, undriven, dt 0.02 s"] = {"id": "", "dt": 0.02}
+    free |= {f"{id}, undriven": {"id": id} for id in UNDRIVEN}
+    return made + [ReportJob(SECTION, name, "environments:undriven", given) for name, given in free.items()]
 
 
 def longest(task: Task) -> float | None:

@@ -294,15 +294,11 @@ def first_step_seconds(name: str, rounds: int) -> Iterator[Row]:
                 )  # fmt: skip
                 yield {"kind": "first", "system": name, "what": kind, "seconds": float(done.stdout)}
     for mode in MODES:
+        row = {"kind": "first", "system": name, "what": f"heyoka, {mode}"}
         try:
-            yield {
-                "kind": "first",
-                "system": name,
-                "what": f"heyoka, {mode}",
-                "seconds": _heyoka(system, mode),
-            }
+            yield row | {"seconds": _heyoka(system, mode)}
         except ImportError as error:
-            yield {"kind": "first", "system": name, "what": f"heyoka, {mode}", "problem": error_line(error)}
+            yield row | {"problem": error_line(error)}
             return
 
 

@@ -152,11 +152,7 @@ def verdict(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> str:
     """Summarise for each column how it compares at equal error."""
     parts = []
     for name in COLUMNS:
-        ratios = [
-            here[name].ns / here["lag_envs"].ns
-            for (_, of, _), here in found.items()
-            if of == mode and name in here and "lag_envs" in here
-        ]
+        ratios = [here[name].ns / here["lag_envs"].ns for _, _, here in _cases(found, mode) if name in here]
         if not ratios:
             continue
         worst, wins = min(ratios), sum(r < 1.0 for r in ratios)
@@ -169,25 +165,32 @@ def verdict(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> str:
     )
 
 
+def _cases(
+    found: Mapping[tuple, Mapping[str, BestSetting]], mode: str
+) -> list[tuple[str, float, Mapping[str, BestSetting]]]:
+    """Return system, error and quickest settings where lag_envs is among them."""
+    return [
+        (name, error, here) for (name, of, error), here in found.items() if of == mode and "lag_envs" in here
+    ]
+
+
 def _cell(here: Mapping[str, BestSetting], name: str) -> float | None:
     return round(here[name].ns, 1) if name in here else None
 
 
-def _others(here: Mapping[str, BestSetting]) -> list[tuple[float, str]]:
-    return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
+def _others(here: Mapping[str, BestSetting]) -> list[str]:
+    """Return the columns of others, the quickest first."""
+    return sorted((name for name in here if name != "lag_envs"), key=lambda name: (here[name].ns, name))
 
 
 def best_times(section: str, found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
     """Return the quickest setting of each column, by system and error."""
     rows = []
-    for (system, of, target), here in found.items():
-        if of != mode or "lag_envs" not in here:
-            continue
-        others, own = _others(here), here["lag_envs"]
-        ratio = others[0][0] / own.ns if others else None
+    for system, target, here in _cases(found, mode):
+        own, first = here["lag_envs"], next(iter(_others(here)), None)
         rows.append((
             system, f"{target:g}", round(own.ns, 1), own.label, *(_cell(here, name) for name in COLUMNS),
-            ratio, f"{others[0][1]}: {here[others[0][1]].label}" if others else None,
+            first and here[first].ns / own.ns, first and f"{first}: {here[first].label}",
         ))  # fmt: skip
     return Table(
         f"{section}-times-{mode}",
@@ -209,8 +212,8 @@ def best_times(section: str, found: Mapping[tuple, Mapping[str, BestSetting]], m
 
 def _summary(found: Mapping[tuple, Mapping[str, BestSetting]]) -> Table | None:
     rows = []
-    for (system, mode, target), here in found.items():
-        if mode == "single" and target in (1e-6, 1e-12) and "lag_envs" in here:
+    for system, target, here in _cases(found, "single"):
+        if target in (1e-6, 1e-12):
             together = found[system, "batch", target]
             cells = [_cell(here, name) for name in COLUMNS[:5]]
             rows.append((system, f"{target:g}", _cell(here, "lag_envs"), _cell(together, "lag_envs"), *cells,
@@ -253,14 +256,14 @@ def _fastest(
     found: Mapping[tuple, Mapping[str, BestSetting]], mode: str, who: str, names: Sequence[str]
 ) -> Claim:
     lost, cases = [], 0
-    for (system, of, target), here in found.items():
-        others = [(ns, name) for ns, name in _others(here) if name in names]
-        if of != mode or "lag_envs" not in here or not others:
+    for system, target, here in _cases(found, mode):
+        name = next((name for name in _others(here) if name in names), None)
+        if name is None:
             continue
         cases += 1
-        ns, name = others[0]
-        if ns < here["lag_envs"].ns:
-            lost.append(f"{name} by {here['lag_envs'].ns / ns:.2f} ({system}, {target:g})")
+        own, ns = here["lag_envs"].ns, here[name].ns
+        if ns < own:
+            lost.append(f"{name} by {own / ns:.2f} ({system}, {target:g})")
     told = f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else "")
     return Claim(
         f"lag_envs reaches each error in less time than {who}, {MODES[mode]}.",

@@ -167,7 +167,7 @@ SYSTEMS = {
 class Engine(LibraryRival):
     """A rival with its own model, made of a system's links; it takes one state after the other."""
 
-    batched = False
+    fixed, batched = True, False
 
 
 def _given(problems: Problems) -> tuple[System, Array, Array, Array]:
@@ -218,7 +218,6 @@ class MuJoCoLinks(Engine):
         "implicitfast": (1, 8, 64, 512),
         "RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256),
     }
-    stepped = ("Euler", "implicitfast", "RK4")
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make a model for each field; one is enough if the control is a force."""
@@ -272,7 +271,6 @@ class PinocchioLinks(Engine):
 
     family = "pinocchio"
     settings: ClassVar = {"ABA, RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256)}
-    stepped = ("ABA, RK4",)
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make the model."""

@@ -30,10 +30,8 @@ SUBSTEPS = (1, 4, 16, 64)
 class LibraryRival(Rival):
     """A rival from another library."""
 
-    #: The methods to measure, each with tolerances or substeps.
+    #: The methods to measure, each with tolerances, or with substeps per control step if it is fixed.
     settings: ClassVar[dict[str, Sequence[float]]]
-    #: Methods whose setting is a number of substeps per control step.
-    stepped: ClassVar[Sequence[str]] = ()
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
@@ -42,7 +40,7 @@ class LibraryRival(Rival):
 
     def __init__(self, method: str, setting: float) -> None:
         super().__init__(method, setting)
-        self.fixed = method in self.stepped
+        self.fixed = self.fixed or method.endswith(", fixed")
 
 
 # --- SciPy ---
@@ -315,7 +313,6 @@ class Diffrax(LibraryRival):
         "Tsit5": TOLERANCES[::2], "Dopri8": TOLERANCES[::2], "Tsit5, fixed": (1, 4, 16),
         "Dopri8, fixed": (1, 2, 4),
     }  # fmt: skip
-    stepped = ("Tsit5, fixed", "Dopri8, fixed")
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile."""
@@ -381,7 +378,6 @@ class Torchdiffeq(LibraryRival):
     settings: ClassVar = {
         "dopri5": TOLERANCES[::2], "dopri8": TOLERANCES[::2], "rk4, fixed": SUBSTEPS[:3],
     }  # fmt: skip
-    stepped = ("rk4, fixed",)
     shared = True  # a batch is one tensor
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
@@ -438,8 +434,7 @@ class MuJoCo(LibraryRival):
 
     family = "mujoco"
     settings: ClassVar = {"Euler": SUBSTEPS, "implicitfast": SUBSTEPS, "RK4": SUBSTEPS}
-    stepped = ("Euler", "implicitfast", "RK4")
-    batched = False  # a rollout takes one state after the other
+    fixed, batched = True, False  # a rollout takes one state after the other
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
