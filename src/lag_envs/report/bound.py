@@ -213,8 +213,7 @@ def environment(id: str, n: int) -> Iterator[Row]:
         return entries
 
     def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
-        y = stepped.lift(np.array(state(theta, speed)))
-        drive = Coefficients(*map(float, stepped.drive(y, u, stepped.numbers(), np)))
+        drive = Coefficients(*map(float, stepped.at(state(theta, speed), u)[1]))
         return truncation(theta, speed, drive, dt, stepped.flow.order, digits)
 
     for _ in range(n):

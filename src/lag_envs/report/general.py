@@ -213,10 +213,10 @@ def timed_rivals(
         else:
             found.append(row | {"error": worst, "median": typical})
             samples.append(again(sample))
-    shown = [again(CLOCK.build(problems, dt, 1, together)), *samples]
-    times = interleaved(dict(enumerate(shown)), rounds, process_time)
-    for i, row in enumerate(found):
-        yield row | {"ns": times[i + 1], "clock": times[0]}
+    clock = again(CLOCK.build(problems, dt, 1, together))
+    own, *times = interleaved([clock, *samples], rounds, process_time)
+    for row, ns in zip(found, times, strict=True):
+        yield row | {"ns": ns, "clock": own}
 
 
 def worst_and_median(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:

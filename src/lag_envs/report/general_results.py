@@ -14,7 +14,7 @@ from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.diagrams import labelled_lines
 from lag_envs.report.linkages import SYSTEMS
 from lag_envs.report.motions import CertifiedSeries
-from lag_envs.report.points import MODES, TARGETS
+from lag_envs.report.points import LIBRARIES, MODES, TARGETS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.series import TOLERANCE
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 DT, MEMBERS = 0.02, 200
 #: Orders at which the certificate is tried.
 CERTIFIED_ORDERS = (12, 14, 16, 18, 20, 22)
-LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "compiled": "compiled"}
 #: Largest difference of equal models, and largest loss of energy, relative.
 EQUAL, DRIFT = 1e-12, 1e-9
 
@@ -51,7 +50,7 @@ def column_name(row: Row) -> str:
         return "lag_envs"
     if row["family"] == "compiled":
         return f"{row['method']}, compiled"
-    return LABELS[row["family"]]
+    return LIBRARIES[row["family"]]
 
 
 #: The rivals to compare with, and their columns.
@@ -288,7 +287,7 @@ def _models(rows: Sequence[Row]) -> Table:
         "differences, relative",
         {
             "system": "system",
-            "engine": lambda r: LABELS[r["engine"]],
+            "engine": lambda r: LIBRARIES[r["engine"]],
             "mass matrix": lambda r: r.get("mass", r.get("problem")),
             "acceleration": lambda r: r.get("acceleration"),
         },

@@ -170,8 +170,7 @@ def _count(case: Case, dt: float) -> float:
     if bound.order:
         return float(bound.substeps)
     stepped = Stepped(scene, dt=dt)
-    y, k = stepped.lift(np.array(state)), stepped.numbers()
-    coefficients, variables = stepped.drive(y, control, k, np), stepped.unpack(y, control, k)
+    variables, coefficients = stepped.at(state, control)
     n = 1.0
     while n <= MOST_SUBSTEPS and not stepped.flow.within(variables, coefficients, dt / n, 0.0, np):
         n *= 2.0

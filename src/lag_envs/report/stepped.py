@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from lag_envs.scenes.base import Scene
@@ -64,6 +65,11 @@ class Stepped:
     def pack(self, moved: Any, y: Any, u: Any, dt: Any, k: Any) -> list:
         """Return the lifted state at the end."""
         return self.form.pack(moved, y, [u], dt, k)
+
+    def at(self, state: ArrayLike, u: Any) -> tuple[list, Any]:
+        """Return the flow's variables and coefficients at a state under a control."""
+        y, k = self.lift(np.asarray(state, np.float64)), self.numbers()
+        return self.unpack(y, u, k), self.drive(y, u, k, np)
 
     def largest_majorant(self, dt: float) -> float:
         """Return the x of the bound up to which one series is certified."""

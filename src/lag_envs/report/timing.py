@@ -7,10 +7,10 @@ others, so that times compare methods.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from statistics import median
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import Flow
 
 Array = NDArray[np.float64]
-K = TypeVar("K")
 
 
 class FlowSteps:
@@ -228,8 +227,8 @@ def at_once(kernels: FlowSteps, cases: Sequence[Case], steps: int, dt: float) ->
 
 
 def interleaved(
-    samples: Mapping[K, Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
-) -> dict[K, float]:
+    samples: Sequence[Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
+) -> list[float]:
     """Return each sample's time of a control step [ns], the median over rounds.
 
     Every round runs each sample once, so that a slow phase of the machine affects all of them.
@@ -237,17 +236,17 @@ def interleaved(
     Examples
     --------
     >>> ticks = iter(range(1000))
-    >>> interleaved({"a": Sample(lambda: None, 2)}, clock=lambda: next(ticks))
-    {'a': 500000000.0}
+    >>> interleaved([Sample(lambda: None, 2)], clock=lambda: next(ticks))
+    [500000000.0]
     """
-    times: dict[K, list[float]] = {name: [] for name in samples}
-    for sample in samples.values():
+    times: list[list[float]] = [[] for _ in samples]
+    for sample in samples:
         sample.prepare()
         sample.run()  # compiles, and warms up
     for _ in range(rounds):
-        for name, sample in samples.items():
+        for sample, found in zip(samples, times, strict=True):
             sample.prepare()
             before = clock()
             sample.run()
-            times[name].append((clock() - before) / sample.steps)
-    return {name: 1e9 * median(values) for name, values in times.items()}
+            found.append((clock() - before) / sample.steps)
+    return [1e9 * median(found) for found in times]

@@ -262,9 +262,9 @@ def variant_points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                         no_better = row["error"] > 0.7 * done.get(rival.method, math.inf)
                         done[rival.method] = -1.0 if at_rounding or no_better else row["error"]
             clock = timed(ShippedStepping(ShippedStepping.METHOD, 1), base, dt, steps, together)
-            times = interleaved(dict(enumerate([clock, *samples])), 5 if quick else 9)
-            for i, row in enumerate(found):
-                yield row | {"ns": times[i + 1], "clock": times[0]}
+            own, *times = interleaved([clock, *samples], 5 if quick else 9)
+            for row, ns in zip(found, times, strict=True):
+                yield row | {"ns": ns, "clock": own}
 
 
 def point(
