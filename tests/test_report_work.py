@@ -88,7 +88,7 @@ def test_the_shipped_stepping_is_what_simulate_does(name):
 
 @pytest.mark.parametrize("quick", [True, False])
 @pytest.mark.parametrize("name", VARIANTS)
-def test_only_what_is_shipped_counts_as_lag_envs(name, quick, monkeypatch):
+def test_only_what_is_shipped_counts_as_lag_envs(name, quick):
     """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
         found = work_precision.variant_rivals(name, horizon, "compiled", quick)
@@ -98,16 +98,6 @@ def test_only_what_is_shipped_counts_as_lag_envs(name, quick, monkeypatch):
         }
         assert {r.family for r in found} == {"lag_envs", "compiled"}
         assert not any("series" in r.method for r in found)
-    flows = []
-    original = FlowSteps.__init__
-    monkeypatch.setattr(
-        FlowSteps,
-        "__init__",
-        lambda self, scene, flow=None, dt=0.02: (flows.append(flow), original(self, scene, flow, dt))[1],
-    )
-    case = ensemble(name, 1)[0]
-    ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False)
-    assert flows == [None]
 
 
 def test_a_refused_step_is_no_point():
