@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from covering import covering
@@ -35,6 +36,7 @@ from lag_envs.benchmark.peak import PRODUCTS
 from lag_envs.benchmark.results import quartiles, ratios, row_summary
 from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure_rates
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, has_own_flow, verdicts
+from lag_envs.envs.single import LagrangianEnv
 from lag_envs.scenes import CartPole
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import count_operations, record_block
@@ -403,11 +405,6 @@ def test_chains_in_the_documentation(tmp_path):
 
 def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
     """Over a short step Euler's error is small: the same start goes the same way, to the same ending."""
-    import gymnasium as gym
-    import numpy as np
-
-    from lag_envs.envs.single import LagrangianEnv
-
     twin = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
     original = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
     original.tau = 1e-4
@@ -537,8 +534,6 @@ def test_rates_have_three_digits(value, text):
 
 
 def test_episodes_are_spread_out():
-    import gymnasium as gym
-
     envs = gym.make_vec(ID, num_envs=4, duration=0.16)  # 8 steps
     envs.reset(seed=0)
     actions = random_actions(4)

@@ -122,7 +122,7 @@ def episode_errors(
 ) -> Row:
     """Return errors and amplified rounding, each the largest up to a time.
 
-    They are relative to the states' sizes, but those of the "entries" in their units. "one step" is the
+    Those of the "entries" are in their units, all others relative to the states' sizes. "one step" is the
     largest error of any single step of the episode.
 
     Parameters
