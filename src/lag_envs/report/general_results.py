@@ -186,10 +186,10 @@ def best_times(section: str, found: Mapping[tuple, Mapping[str, BestSetting]], m
     """Return the quickest setting of each column, by system and error."""
     rows = []
     for system, target, here in _cases(found, mode):
-        own, first = here["lag_envs"], next(iter(_others(here)), None)
+        own, quickest = here["lag_envs"], next(iter(_others(here)), None)
         rows.append((
             system, f"{target:g}", round(own.ns, 1), own.label, *(_cell(here, name) for name in COLUMNS),
-            first and here[first].ns / own.ns, first and f"{first}: {here[first].label}",
+            quickest and here[quickest].ns / own.ns, quickest and f"{quickest}: {here[quickest].label}",
         ))  # fmt: skip
     return Table(
         f"{section}-times-{mode}",

@@ -148,10 +148,8 @@ class SceneProblems(Problems):
         held = dict(zip(layout.controls, self.controls.T, strict=True))
         for p in layout.at("acceleration", "rate"):
             push = held[p.control or ""] if p.level == "acceleration" else 0.0
-            q[p.name], v[p.name] = (
-                q[p.name] + span * (v[p.name] + span * (0.5 * push)),
-                v[p.name] + span * push,
-            )
+            q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * push))
+            v[p.name] = v[p.name] + span * push
         v = self._shifted(q, v, 1.0)
         return np.stack([(q if e.kind == "place" else v)[e.coordinate] for e in layout.state], axis=1)
 
@@ -159,8 +157,8 @@ class SceneProblems(Problems):
 class CertifiedSeries(Rival):
     """The general engine at an order and a tolerance, each step certified, in its shipped loops.
 
-    Alone it runs the loop of `Scene.simulate`, in a batch the block function of the vector environments, both
-    over one control step from each state.
+    The setting is the tolerance. Alone it runs the loop of `Scene.simulate`, in a batch the block function of
+    the vector environments, both over one control step from each state.
     """
 
     family = "lag_envs"
