@@ -64,7 +64,7 @@ def test_order_of_convergence(method):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_is_exact(name, mode):
     """A regression of the shipped stepper's accuracy fails here."""
-    assert worst(ShippedStepping(ShippedStepping.METHOD, 1), name, mode == "batch", count=12) < 1e-15
+    assert worst(ShippedStepping(), name, mode == "batch", count=12) < 1e-15
 
 
 @pytest.mark.parametrize("name", every(2, VARIANTS))
@@ -75,15 +75,15 @@ def test_the_shipped_stepping_is_what_simulate_does(name):
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
     found = (
-        (ShippedStepping.METHOD, 1, dt, 3),
-        (ShippedStepping.METHOD, 2, dt / 2, 6),
-        (ShippedStepping.ONE_CALL, 1, steps * dt, 1),
+        (ShippedStepping(), dt, 3),
+        (ShippedStepping(2), dt / 2, 6),
+        (ShippedStepping(one_call=True), steps * dt, 1),
     )
-    for method, n, length, count in found:
+    for rival, length, count in found:
         ends = [c.scene.simulate(c.state, [c.control] * count, length)[-1] for c in cases]
         for together in (False, True):
-            sample = ShippedStepping(method, n).build(Problems(cases), dt, steps, together)
-            assert np.array_equal(sample.end(), ends), (method, n, together)
+            sample = rival.build(Problems(cases), dt, steps, together)
+            assert np.array_equal(sample.end(), ends), (rival.method, rival.setting, together)
 
 
 @pytest.mark.parametrize("quick", [True, False])
@@ -103,7 +103,7 @@ def test_only_what_is_shipped_counts_as_lag_envs(name, quick):
 def test_a_refused_step_is_no_point():
     case = ensemble("PivotedBar", 1)[0]._replace(state=(0.0, 1e12))
     with pytest.raises(ArithmeticError, match="refused"):
-        ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
+        ShippedStepping().build(Problems([case]), 0.02, 1, False).end()
 
 
 def test_kernels_refuse_other_constants():

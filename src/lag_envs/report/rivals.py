@@ -95,14 +95,14 @@ class ShippedStepping(Rival):
 
     changing = True  # a trajectory has a control for each step
 
-    def __init__(self, method: str, setting: float) -> None:
-        super().__init__(method, setting)
-        self.fixed = method == self.METHOD
+    def __init__(self, setting: float = 1, one_call: bool = False) -> None:
+        super().__init__(self.ONE_CALL if one_call else self.METHOD, setting)
+        self.fixed = not one_call
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the scene's own step; scenes with other parameters are separate batches."""
         cases = problems.cases
-        count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
+        count = self.substeps(steps) if self.fixed else 1
         length = dt * steps / count
         kernels = FlowSteps(cases[0].scene, dt=length)
         alike: dict[Scene, list[Case]] = {}
