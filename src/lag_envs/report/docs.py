@@ -231,15 +231,13 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
                 lines += ["", *_picture(picture)]
         if section["summary"]:
             lines += ["", _table(section["summary"])]
-        holding = sum(claim["holds"] is True for claim in section["claims"])
-        lines += ["", f"{holding} of {len(section['claims'])} claims hold.", "", *_command(part.section)]
+        lines += ["", f"{_holding(section['claims'])}.", "", *_command(part.section)]
         lines += [f"[Method, all tables and figures]({DETAILS}#{_anchor(section['title'])})"]
     lines += [
         "",
         "## What does not hold",
         "",
-        f"{sum(claim['holds'] is True for claim in claims)} of {len(claims)} claims hold"
-        + (". These do not:" if broken else "."),
+        _holding(claims) + (". These do not:" if broken else "."),
         *([""] if broken else []),
         *(f"- {claim['text']} ({claim['evidence']})" for claim in broken),
         "",
@@ -298,6 +296,10 @@ def details(accuracy: dict[str, Any]) -> str:
         if section["problems"]:
             lines += ["", "Did not work:", "", *(f"- {problem}" for problem in section["problems"])]
     return "\n".join(lines) + "\n"
+
+
+def _holding(claims: Sequence[dict[str, Any]]) -> str:
+    return f"{sum(claim['holds'] is True for claim in claims)} of {len(claims)} claims hold"
 
 
 def _picture(picture: dict[str, str]) -> list[str]:

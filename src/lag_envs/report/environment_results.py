@@ -38,7 +38,7 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     cases = {case: [r for r in rows if r["case"] == case] for case in dict.fromkeys(r["case"] for r in rows)}
     episodes = {case: group for case, group in cases.items() if group[0]["seed"] is not None}
-    free = {case: group for case, group in cases.items() if group[0]["seed"] is None}
+    free = [r for r in rows if r["seed"] is None]
     failed = {result.name: result.problem or "" for result in problems}
     pictures = []
     if episodes:
@@ -171,11 +171,11 @@ def _entries_table(cases: dict[str, list[Row]]) -> Table:
     )
 
 
-def _free_table(free: dict[str, list[Row]]) -> Table:
+def _free_table(free: list[Row]) -> Table:
     lines = []
-    for case, row in ((case, row) for case, group in free.items() for row in group):
+    for row in free:
         angle = next(e for e in row["entries"] if e["name"] == "theta")
-        steps = [case, row["integrator"], row["dt"], angle["one step"], angle["1 s"], angle["10 s"]]
+        steps = [row["case"], row["integrator"], row["dt"], angle["one step"], angle["1 s"], angle["10 s"]]
         lines.append([*steps, row["amplified"]["10 s"], _ratio(row), 100.0 * row["gain"]])
     return Table(
         "environment-undriven",

@@ -113,19 +113,15 @@ def run_jobs(
         tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are reused from before")
     complete = True
     with progress(len(todo)) as advance:
-
-        def keep(result: JobResult) -> None:
-            known[result.key] = result
-            store.append(file, vars(result))
-            advance(f"{result.section}: {result.name}")
-            if result.problem:
-                tell(f"{result.section}: {result.name}: {result.problem}")
-
-        pools = [([job for job in todo if not job.alone], processes), ([job for job in todo if job.alone], 1)]
         try:
-            for part, count in pools:
-                for result in _in_processes(part, folder, count):
-                    keep(result)
+            for alone in (False, True):
+                part = [job for job in todo if job.alone is alone]
+                for result in _in_processes(part, folder, 1 if alone else processes):
+                    known[result.key] = result
+                    store.append(file, vars(result))
+                    advance(f"{result.section}: {result.name}")
+                    if result.problem:
+                        tell(f"{result.section}: {result.name}: {result.problem}")
         except KeyboardInterrupt:
             complete = False
     return [known[job.key] for job in jobs if job.key in known], complete
