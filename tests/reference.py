@@ -53,10 +53,8 @@ def moving_plane(k, beta, gravity, radius, tilt_rate, state, dt):
 
 def _moving(scene, state, control):
     """Return place and velocity of the free coordinate, and the coefficients of its flow."""
-    stepped = Stepped(scene)
-    y, k = stepped.lift(np.array([float(x) for x in state])), stepped.numbers()
-    q, v = stepped.unpack(y, float(control), k)[:2]
-    return float(q), float(v), stepped.drive(y, float(control), k, np)
+    (q, v, *_), coefficients = Stepped(scene).at([float(x) for x in state], float(control))
+    return float(q), float(v), coefficients
 
 
 def scales(scene_name, params, state, control, dt):

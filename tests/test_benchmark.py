@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from covering import covering
@@ -35,6 +36,7 @@ from lag_envs.benchmark.peak import PRODUCTS
 from lag_envs.benchmark.results import quartiles, ratios, row_summary
 from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure_rates
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, has_own_flow, verdicts
+from lag_envs.envs.single import LagrangianEnv
 from lag_envs.scenes import CartPole
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import count_operations, record_block
@@ -403,11 +405,6 @@ def test_chains_in_the_documentation(tmp_path):
 
 def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
     """Over a short step Euler's error is small: the same start goes the same way, to the same ending."""
-    import gymnasium as gym
-    import numpy as np
-
-    from lag_envs.envs.single import LagrangianEnv
-
     twin = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
     original = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
     original.tau = 1e-4
@@ -431,12 +428,6 @@ def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
 
 def made(library, id, kind, num_envs, rates):
     return Contestant(library, id, kind, num_envs, lambda: None, rates)
-
-
-def test_ratios_are_taken_within_a_round():
-    # The machine is ten times slower in the second round: the ratio of medians would be 2.5.
-    assert ratios([40.0, 4.0, 50.0], [20.0, 2.0, 10.0]) == [2.0, 2.0, 5.0]
-    assert quartiles([2.0, 2.0, 5.0])[1] == 2.0
 
 
 def test_rows_are_compared_with_cartpole_of_their_size():
@@ -543,8 +534,6 @@ def test_rates_have_three_digits(value, text):
 
 
 def test_episodes_are_spread_out():
-    import gymnasium as gym
-
     envs = gym.make_vec(ID, num_envs=4, duration=0.16)  # 8 steps
     envs.reset(seed=0)
     actions = random_actions(4)

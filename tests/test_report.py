@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from lag_envs.cli import main
 from lag_envs.report import docs, page
 from lag_envs.report.report import SECTIONS, NotAReport, ReportSettings, content_of, make_report, prepare
-from lag_envs.report.runner import load_results, module, run_jobs
+from lag_envs.report.runner import JobResult, load_results, module, run_jobs
 from tests import dummy_section
 from tests.dummy_section import job
 
@@ -205,16 +205,26 @@ def test_missing_package(monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", SECTIONS)
 def test_sections_stand_without_rows(name):
-    """A report that was interrupted early still makes a page, and claims nothing."""
-    content = module(name).content([], [])
-    assert content.title and content.text
+    """A report that was interrupted early still makes a page, and claims nothing; some tables tell why."""
+    content = module(name).content([], [JobResult(name, "lost", "key", problem="stopped after 1 s")])
+    assert content.title and content.text and not content.pictures
     assert [claim.text for claim in content.claims if claim.holds is not None] == []
-    jobs = module(name).jobs(True) + module(name).jobs(False)
-    assert all(j.section == name for j in jobs)
-    for place, function in {tuple(j.function.split(":")) for j in jobs}:
-        assert callable(getattr(module(place), function)), (place, function)
-    for some in (module(name).jobs(True), module(name).jobs(False)):
-        assert len({j.name for j in some}) == len(some) > 0
+    assert content.summary is None or not content.summary.rows
+    told = name in ("environments", "work_precision", "bound", "stability")
+    lines = [(line[0], line[-1]) for table in content.tables for line in table.rows]
+    assert lines == [("lost", "stopped after 1 s")] * told
+    assert all(len(line) == len(table.columns) for table in content.tables for line in table.rows)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+@pytest.mark.parametrize("name", SECTIONS)
+def test_jobs_can_be_sent(name, quick):
+    jobs = module(name).jobs(quick)
+    assert len({j.name for j in jobs}) == len(jobs) > 0
+    for j in jobs:
+        place, function = j.function.split(":")
+        assert j.section == place == name and callable(getattr(module(place), function)), j
+        json.dumps(j.arguments, allow_nan=False)
 
 
 # --- the compact form ---

@@ -9,13 +9,10 @@ from mpmath import mp, mpf
 from lag_envs.report import bound, extremes, reference, stability, stability_maps, stability_results
 from lag_envs.report.cases import Case, ensemble, scales
 from lag_envs.report.oracle import Unresolved
-from lag_envs.report.runner import JobResult
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.tasks import cylinder_in_cylinder
-
-PROBLEM = JobResult("bound", "lost", "key", problem="stopped after 1 s")
 
 
 def draw(content):
@@ -98,26 +95,6 @@ def test_environments_keep_within_the_bound():
     assert content.summary.rows[0][3] == 6.7  # rounded down
     draw(content)
     draw(bound.content([reach], []))
-
-
-@pytest.mark.parametrize("section", [bound, stability])
-def test_sections_without_rows(section):
-    content = section.content([], [PROBLEM])
-    assert [claim.holds for claim in content.claims] == [None, None]
-    assert content.tables[-1].rows == [["lost", "stopped after 1 s"]]
-    draw(content)
-
-
-@pytest.mark.parametrize("section", [bound, stability])
-@pytest.mark.parametrize("quick", [False, True])
-def test_jobs_can_be_sent(section, quick):
-    found = section.jobs(quick)
-    assert len({job.name for job in found}) == len(found)
-    for job in found:
-        module, _, name = job.function.partition(":")
-        assert module == section.SECTION
-        assert hasattr(section, name)
-        json.dumps(job.arguments, allow_nan=False)
 
 
 # --- stiff and extreme cases ---
@@ -213,10 +190,11 @@ def test_formulas_on_arrays_are_the_compiled_ones():
     """The comparison integrators as NumPy formulas give the same as the compiled flows."""
     from lag_envs.report.integrators import comparison
     from lag_envs.report.stepped import Stepped
+    from lag_envs.report.timing import FlowSteps
 
     case = Case(PivotedBar(track=None, damping=0.01), (2.0, 3.0), 3.0)
     flow = comparison("RK4", Stepped(case.scene).flow)
-    compiled = Stepped(case.scene, flow).simulate(case.state, [case.control] * 16, 0.1 / 16)[-1]
+    compiled = FlowSteps(case.scene, flow).end(case, 0.1 / 16, 16)
     (formula,) = stability.step_cases(flow.fast, [case], 0.1, np.array([16]), np.float64)
     assert formula == pytest.approx(compiled.tolist(), rel=1e-13)
 

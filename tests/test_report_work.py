@@ -6,6 +6,7 @@ import re
 import sys
 from fractions import Fraction
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
 from lag_envs.report.points import LAG_ENVS, MODES, TARGETS, WorkPrecisionPoint
 from lag_envs.report.rivals import CompiledMethod, ShippedStepping
-from lag_envs.report.runner import JobResult
 from lag_envs.report.timing import FlowSteps
 from lag_envs.report.work_precision import OrderedMethod
 from lag_envs.scenes.derivation import form_of
@@ -64,7 +64,7 @@ def test_order_of_convergence(method):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_is_exact(name, mode):
     """A regression of the shipped stepper's accuracy fails here."""
-    assert worst(ShippedStepping(ShippedStepping.METHOD, 1), name, mode == "batch", count=12) < 1e-15
+    assert worst(ShippedStepping(), name, mode == "batch", count=12) < 1e-15
 
 
 @pytest.mark.parametrize("name", every(2, VARIANTS))
@@ -75,20 +75,20 @@ def test_the_shipped_stepping_is_what_simulate_does(name):
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
     found = (
-        (ShippedStepping.METHOD, 1, dt, 3),
-        (ShippedStepping.METHOD, 2, dt / 2, 6),
-        (ShippedStepping.ONE_CALL, 1, steps * dt, 1),
+        (ShippedStepping(), dt, 3),
+        (ShippedStepping(2), dt / 2, 6),
+        (ShippedStepping(one_call=True), steps * dt, 1),
     )
-    for method, n, length, count in found:
+    for rival, length, count in found:
         ends = [c.scene.simulate(c.state, [c.control] * count, length)[-1] for c in cases]
         for together in (False, True):
-            sample = ShippedStepping(method, n).build(Problems(cases), dt, steps, together)
-            assert np.array_equal(sample.end(), ends), (method, n, together)
+            sample = rival.build(Problems(cases), dt, steps, together)
+            assert np.array_equal(sample.end(), ends), (rival.method, rival.setting, together)
 
 
 @pytest.mark.parametrize("quick", [True, False])
 @pytest.mark.parametrize("name", VARIANTS)
-def test_only_what_is_shipped_counts_as_lag_envs(name, quick, monkeypatch):
+def test_only_what_is_shipped_counts_as_lag_envs(name, quick):
     """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
         found = work_precision.variant_rivals(name, horizon, "compiled", quick)
@@ -98,22 +98,12 @@ def test_only_what_is_shipped_counts_as_lag_envs(name, quick, monkeypatch):
         }
         assert {r.family for r in found} == {"lag_envs", "compiled"}
         assert not any("series" in r.method for r in found)
-    flows = []
-    original = FlowSteps.__init__
-    monkeypatch.setattr(
-        FlowSteps,
-        "__init__",
-        lambda self, scene, flow=None, dt=0.02: (flows.append(flow), original(self, scene, flow, dt))[1],
-    )
-    case = ensemble(name, 1)[0]
-    ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False)
-    assert flows == [None]
 
 
 def test_a_refused_step_is_no_point():
     case = ensemble("PivotedBar", 1)[0]._replace(state=(0.0, 1e12))
     with pytest.raises(ArithmeticError, match="refused"):
-        ShippedStepping(ShippedStepping.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
+        ShippedStepping().build(Problems([case]), 0.02, 1, False).end()
 
 
 def test_kernels_refuse_other_constants():
@@ -251,7 +241,7 @@ def test_a_scene_of_ones_own():
 
     exact = 1e-6 * np.cos(np.sqrt(Some.p[0]) * 0.4)
     found = [CompiledMethod("RK4", 8), CompiledMethod("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
-    for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if _has("heyoka") else []):
+    for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if find_spec("heyoka") else []):
         for together in (False, True):
             ends = rival.build(Some(), 0.1, 4, together).end()
             assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
@@ -263,14 +253,6 @@ def test_a_scene_of_ones_own():
     with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
         CompiledMethod("ETD4RK", 1).build(Some(), 0.1, 4, False)
     assert "Verlet" in CompiledMethod.methods(Problems(ensemble("PivotedBar", 1)).equation)
-
-
-def _has(package):
-    try:
-        __import__(package)
-    except ImportError:
-        return False
-    return True
 
 
 def test_a_missing_library_is_a_row(monkeypatch):
@@ -481,14 +463,6 @@ def test_errors_below_amplified_rounding_are_none():
     assert claimed(rows).holds is True
     floor = {"kind": "rounding", "variant": "PivotedBar", "horizon": "one step", "amplified": 1e-12}
     assert claimed([*rows, floor]).holds is False
-
-
-def test_a_lost_job_is_a_row_and_claims_nothing():
-    """Without rows every claim is open; the problem is stated."""
-    lost = JobResult("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
-    content = work_precision.content([], [lost])
-    assert all(claim.holds is None for claim in content.claims)
-    assert any("stopped after 120 s" in row for table in content.tables for row in table.rows)
 
 
 def test_the_picture_has_the_fastest_form_of_each():

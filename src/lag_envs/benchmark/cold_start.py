@@ -43,21 +43,18 @@ STAGES = (
 
 def cold_starts(id: str, count: int, times: dict[str, list[list[float]]], files: Sequence[str] = ()) -> bool:
     """Time the stages of whole processes into `times`; return False if the user interrupted it."""
-    empty = (count + 1) // 2
-    with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
-        try:
-            for i in range(empty):
-                advance("cold start, cache empty")
-                stopping_point()
-                stages = cold_start(id, f"{folder}/{i}", files)
-                times.setdefault("empty", []).append(stages)
-            for _ in range(count):
-                advance("cold start, cache filled")
-                stopping_point()
-                stages = cold_start(id, f"{folder}/0", files)
-                times.setdefault("filled", []).append(stages)
-        except KeyboardInterrupt:
-            return False
+    with tempfile.TemporaryDirectory() as folder:
+        caches = [("empty", f"{folder}/{i}") for i in range((count + 1) // 2)]
+        caches += [("filled", f"{folder}/0")] * count
+        with progress(len(caches)) as advance:
+            try:
+                for state, cache in caches:
+                    advance(f"cold start, cache {state}")
+                    stopping_point()
+                    stages = cold_start(id, cache, files)
+                    times.setdefault(state, []).append(stages)
+            except KeyboardInterrupt:
+                return False
     return True
 
 

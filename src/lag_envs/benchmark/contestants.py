@@ -3,39 +3,40 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 from lag_envs.benchmark.environments import as_users_make_it, own_vector, unwrapped
 from lag_envs.benchmark.peak import NUMBERS, peak
 from lag_envs.benchmark.peers import PEERS
-from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant
+from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant, Run
 
 
 def contestants(
     ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = (), threads: int = 1
 ) -> list[Contestant]:
     """Return our environments, also with other keywords and several threads, and the peers."""
+
+    def batches(library: str, name: str, prepare: Callable[[int], Run]) -> list[Contestant]:
+        return [Contestant(library, name, "vector", n, partial(prepare, n)) for n in sizes]
+
     rows = []
     for id in ids:
         rows += [Contestant("lag_envs", id, "made", 1, partial(as_users_make_it, id))]
         rows += [Contestant("lag_envs", id, "unwrapped", 1, partial(unwrapped, id))]
-        rows += [Contestant("lag_envs", id, "vector", n, partial(own_vector, id, n)) for n in sizes]
+        rows += batches("lag_envs", id, partial(own_vector, id))
         if threads > 1:
-            shared = partial(own_vector, id, num_threads=threads)
-            rows += [Contestant(THREADED, id, "vector", n, partial(shared, n)) for n in sizes]
+            rows += batches(THREADED, id, partial(own_vector, id, num_threads=threads))
         for text in keywords:
             given, name = keywords_of(text), f"{id}, {text}"
             rows += [Contestant(VARIED, name, "unwrapped", 1, partial(unwrapped, id, **given))]
-            rows += [
-                Contestant(VARIED, name, "vector", n, partial(own_vector, id, n, **given)) for n in sizes
-            ]
+            rows += batches(VARIED, name, partial(own_vector, id, **given))
     for id in ("CartPole-v1", "Pendulum-v1"):
         rows += [Contestant("gymnasium", id, "made", 1, partial(as_users_make_it, id))]
     rows += [Contestant(CORE, "multiply-adds", "arithmetic", NUMBERS, peak)]
     for library, id, prepare in PEERS:
-        rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]
+        rows += batches(library, id, prepare)
     return rows
 
 

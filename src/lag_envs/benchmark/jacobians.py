@@ -89,51 +89,50 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
         a row of a batch, ``ratio`` and its ``aim`` 1 + 2K; ``call_us`` of one call, and ``call_ratio`` to one
         of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which should be at most 4.
     """
-    found = []
-    for name in names or CASES:
-        scene = CASES[name]()
-        rng = np.random.default_rng(0)
-        states = rng.uniform(-1.0, 1.0, (BATCH, len(scene.state_names)))
-        controls = rng.uniform(0.0, 1.0, (BATCH, len(scene.control_names)))
-        steps = compile_steps(scene, DT)
+    return [_cost(name, rounds, clock) for name in names or CASES]
 
-        def run_steps(steps: Any = steps, states: Any = states, controls: Any = controls) -> None:
-            for _ in range(CALLS):
-                steps(states, controls)
 
-        def run_batch(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
-            scene.jacobian(states, controls, DT)
+def _cost(name: str, rounds: int, clock: Callable[[], float]) -> dict[str, Any]:
+    """Return the row of a scene."""
+    scene = CASES[name]()
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1.0, 1.0, (BATCH, len(scene.state_names)))
+    controls = rng.uniform(0.0, 1.0, (BATCH, len(scene.control_names)))
+    steps = compile_steps(scene, DT)
 
-        def simulate(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
-            for i in range(CALLS):
-                scene.simulate(states[i], controls[i : i + 1], DT)
+    def run_steps() -> None:
+        for _ in range(CALLS):
+            steps(states, controls)
 
-        def call(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
-            for i in range(CALLS):
-                scene.jacobian(states[i], controls[i], DT)
+    def simulate() -> None:
+        for i in range(CALLS):
+            scene.simulate(states[i], controls[i : i + 1], DT)
 
-        def run_back(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
-            scene.vjp(states, controls, DT, states)
+    def call() -> None:
+        for i in range(CALLS):
+            scene.jacobian(states[i], controls[i], DT)
 
-        times = _least((run_steps, run_batch, simulate, call, run_back), rounds, clock)
-        step, batch, one, single = times[0] / CALLS / BATCH, times[1] / BATCH, times[2], times[3]
-        back = times[4] / BATCH
-        columns = states.shape[1] + controls.shape[1]
-        found.append(
-            {
-                "name": name,
-                "columns": columns,
-                "step_ns": round(1e9 * step, 1),
-                "jacobian_ns": round(1e9 * batch, 1),
-                "ratio": round(batch / step, 2),
-                "aim": 1 + 2 * columns,
-                "call_us": round(1e6 * single / CALLS, 1),
-                "call_ratio": round(single / one, 2),
-                "vjp_ns": round(1e9 * back, 1),
-                "vjp_ratio": round(back / step, 2),
-            }
-        )
-    return found
+    runs = (
+        run_steps,
+        lambda: scene.jacobian(states, controls, DT),
+        simulate,
+        call,
+        lambda: scene.vjp(states, controls, DT, states),
+    )
+    all_steps, batch, one, single, back = _least(runs, rounds, clock)
+    step, columns = all_steps / CALLS, states.shape[1] + controls.shape[1]
+    return {
+        "name": name,
+        "columns": columns,
+        "step_ns": round(1e9 * step / BATCH, 1),
+        "jacobian_ns": round(1e9 * batch / BATCH, 1),
+        "ratio": round(batch / step, 2),
+        "aim": 1 + 2 * columns,
+        "call_us": round(1e6 * single / CALLS, 1),
+        "call_ratio": round(single / one, 2),
+        "vjp_ns": round(1e9 * back / BATCH, 1),
+        "vjp_ratio": round(back / step, 2),
+    }
 
 
 def backwards(
@@ -157,47 +156,40 @@ def backwards(
         most 4.
     """
     smooth = [name for name, kind in TASKS.items() if not kind().formulas.choices and not kind.imperfections]
-    found = []
-    for name in ids or {TASKS[name].scene: name for name in reversed(smooth)}.values():
-        envs = LagrangianVectorEnv(TASKS[name], count, num_threads=1)
-        envs.reset(seed=0)
-        rng, reverse = np.random.default_rng(0), Model(envs.task).reverse()
-        actions = rng.uniform(-1.0, 1.0, (STEPS, count, envs.task.formulas.actions)).astype(np.float32)
-        targets = np.zeros((count, 0)) if envs.target is None else envs.target.reshape(count, -1)
-        states = [envs.state]
+    of_scenes = {TASKS[name].scene: name for name in reversed(smooth)}
+    return [_backwards(name, rounds, clock, count) for name in ids or of_scenes.values()]
+
+
+def _backwards(name: str, rounds: int, clock: Callable[[], float], count: int) -> dict[str, Any]:
+    """Return the row of an environment."""
+    envs = LagrangianVectorEnv(TASKS[name], count, num_threads=1)
+    envs.reset(seed=0)
+    rng, reverse = np.random.default_rng(0), Model(envs.task).reverse()
+    actions = rng.uniform(-1.0, 1.0, (STEPS, count, envs.task.formulas.actions)).astype(np.float32)
+    targets = np.zeros((count, 0)) if envs.target is None else envs.target.reshape(count, -1)
+    states = [envs.state]
+    for action in actions:
+        envs.step(action)
+        states.append(envs.state)
+    seeds = np.ones_like(states[0]), np.ones((count, len(envs.task.formulas.observation))), np.ones(count)
+
+    def step() -> None:
         for action in actions:
             envs.step(action)
-            states.append(envs.state)
-        seeds = np.ones_like(states[0]), np.ones((count, len(envs.task.formulas.observation))), np.ones(count)
 
-        def step(envs: Any = envs, actions: Any = actions) -> None:
-            for action in actions:
-                envs.step(action)
+    def back() -> None:
+        for i, action in enumerate(actions):
+            reverse.pull(states[i], action, targets, states[i + 1], states[i + 1], *seeds)
 
-        def back(
-            pull: Any = reverse.pull,
-            states: Any = states,
-            actions: Any = actions,
-            targets: Any = targets,
-            seeds: Any = seeds,
-        ) -> None:
-            for i, action in enumerate(actions):
-                pull(states[i], action, targets, states[i + 1], states[i + 1], *seeds)
-
-        def start(envs: Any = envs) -> None:
-            envs.reset(seed=0)
-
-        # Both from the same states: how a step is divided depends on them.
-        step_ns, back_ns = (1e9 * x / STEPS / count for x in _least((step, back), rounds, clock, start))
-        found.append(
-            {
-                "id": name,
-                "step_ns": round(step_ns, 1),
-                "back_ns": round(back_ns, 1),
-                "ratio": round(back_ns / step_ns, 2),
-            }
-        )
-    return found
+    # Both from the same states: how a step is divided depends on them.
+    times = _least((step, back), rounds, clock, before=lambda: envs.reset(seed=0))
+    step_ns, back_ns = (1e9 * x / STEPS / count for x in times)
+    return {
+        "id": name,
+        "step_ns": round(step_ns, 1),
+        "back_ns": round(back_ns, 1),
+        "ratio": round(back_ns / step_ns, 2),
+    }
 
 
 def backwards_table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
@@ -207,10 +199,10 @@ def backwards_table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
 
 
 def _least(
-    runs: Sequence[Callable[[], None]],
+    runs: Sequence[Callable[[], object]],
     rounds: int,
     clock: Callable[[], float],
-    before: Callable[[], None] = lambda: None,
+    before: Callable[[], object] = lambda: None,
 ) -> list[float]:
     """Return the shortest time of each [s], without that of `before`; all of them run once first."""
     least = [float("inf")] * len(runs)
@@ -230,32 +222,15 @@ def _least(
 def jacobian_table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return the rows of a table, the first with the columns' names."""
     head = (
-        "Jacobian of a step",
-        "columns",
-        "step, ns",
-        "row, ns",
-        "steps",
-        "aim",
-        "call, µs",
-        "of a step's",
-        "backwards, ns",
-        "steps",
-    )
-    return [
-        head,
-        *(
-            (
-                row["name"],
-                str(row["columns"]),
-                f"{row['step_ns']:,.0f}",
-                f"{row['jacobian_ns']:,.0f}",
-                f"{row['ratio']:.1f}",
-                f"{row['aim']}",
-                f"{row['call_us']:.0f}",
-                f"{row['call_ratio']:.1f}",
-                f"{row['vjp_ns']:,.0f}" if "vjp_ns" in row else "–",
-                f"{row['vjp_ratio']:.1f}" if "vjp_ratio" in row else "–",
-            )
-            for row in rows
-        ),
-    ]
+        "Jacobian of a step", "columns", "step, ns", "row, ns", "steps", "aim", "call, µs", "of a step's",
+        "backwards, ns", "steps",
+    )  # fmt: skip
+    cells = [
+        (
+            r["name"], str(r["columns"]), f"{r['step_ns']:,.0f}", f"{r['jacobian_ns']:,.0f}",
+            f"{r['ratio']:.1f}", str(r["aim"]), f"{r['call_us']:.0f}", f"{r['call_ratio']:.1f}",
+            f"{r['vjp_ns']:,.0f}", f"{r['vjp_ratio']:.1f}",
+        )
+        for r in rows
+    ]  # fmt: skip
+    return [head, *cells]

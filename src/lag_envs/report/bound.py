@@ -7,7 +7,7 @@ the series' order, from the oracle. Rounding plays no part.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -203,56 +203,34 @@ def environment(id: str, n: int) -> Iterator[Row]:
     stepped = Stepped(scene, dt=dt)
     low, high = (float(u[0]) for u in task.control_range)
     reach = task.certified_speed()
-    assert reach is not None
-    rng = np.random.default_rng(1)
+    assert reach is not None and stepped.angle is not None
+    angle, rng = stepped.angle, np.random.default_rng(1)
+
+    def state(theta: float, speed: float) -> list[float]:
+        """Return a state whose other entries are at the edge of the task's starts."""
+        entries = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
+        entries[angle : angle + 2] = theta, speed
+        return entries
 
     def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
-        y = stepped.lift(np.array(_state(task, theta, speed)))
-        drive = Coefficients(*map(float, stepped.drive(y, u, stepped.numbers(), np)))
+        drive = Coefficients(*map(float, stepped.at(state(theta, speed), u)[1]))
         return truncation(theta, speed, drive, dt, stepped.flow.order, digits)
 
     for _ in range(n):
         theta, speed, u = (float(v) for v in rng.uniform([-math.pi, -reach, low], [math.pi, reach, high]))
-        known, actual = scene.step_bound(_state(task, theta, speed), u, dt), left_out(theta, speed, u)
+        known, actual = scene.step_bound(state(theta, speed), u, dt), left_out(theta, speed, u)
         row = {"kind": "environment", "id": id, "order": known.order, "dt": dt, "reach": reach}
         row |= {"theta_bound": known.bounds["theta"], "theta": actual[0]}
         row |= {"theta_dot_bound": known.bounds["theta_dot"]}
         yield row | {"theta_dot": actual[1], "speed": speed, "substeps": known.substeps}
     places = [float(v) for v in rng.uniform(-math.pi, math.pi, max(4, n // 5))]
-    needed = _largest(
-        lambda speed: all(
-            left_out(theta, speed, u, 30)[1] <= TOLERANCE for theta in places for u in (low, high)
-        ),
-        steps=10,
-    )
-    yield {
-        "kind": "reach",
-        "id": id,
-        "order": stepped.flow.order,
-        "dt": dt,
-        "certified": reach,
-        "actual": needed,
-    }
-
-
-def _state(task: Any, theta: float, speed: float) -> list[float]:
-    """Return a state with the given angle and rate, the other entries at the edge of the task's starts."""
-    state = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
-    from lag_envs.report.stepped import Stepped
-
-    angle = Stepped(task.scene).angle
-    assert angle is not None
-    state[angle : angle + 2] = theta, speed
-    return state
-
-
-def _largest(good: Callable[[float], bool], steps: int = 40) -> float:
-    """Return the largest speed up to 1e4 rad/s that passes, by bisection."""
-    low, high = 0.0, 1e4
-    for _ in range(steps):
-        middle = math.sqrt(max(low, 1e-2) * high)
-        low, high = (middle, high) if good(middle) else (low, middle)
-    return low
+    slow, fast = 0.0, 1e4  # the largest speed within the tolerance, by bisection
+    for _ in range(10):
+        speed = math.sqrt(max(slow, 1e-2) * fast)
+        good = all(left_out(theta, speed, u, 30)[1] <= TOLERANCE for theta in places for u in (low, high))
+        slow, fast = (speed, fast) if good else (slow, speed)
+    about = {"kind": "reach", "id": id, "order": stepped.flow.order, "dt": dt}
+    yield about | {"certified": reach, "actual": slow}
 
 
 # --- showing ---
@@ -268,15 +246,8 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     }
     measured = kinds["point"] + kinds["environment"]
     broken = [r for r in measured for name, _, _ in QUANTITIES if r[name] > r[f"{name}_bound"]]
-    closest = min((m for r in measured for m in _margins([r])), default=None)
-    tight = _table(
-        "bound-tightness",
-        "Bound over truncation error of one step, both in exact arithmetic, for random drives. It is never "
-        "below 1 if the bound is never broken. 50 % is the median. Per power: the (order + 1)th root of the "
-        "median for θ', the factor by which the bound overestimates the step's length.",
-        kinds["point"],
-        lambda r: f"order {r['order']}",
-    )
+    closest = min((m for name, _, _ in QUANTITIES for m in _margins(measured, name)), default=None)
+    tight = _tightness_table(kinds["point"])
     scenes = _reach_table(kinds["environment"], kinds["reach"])
     counted = [r for r in kinds["cost"] if r["needed"]]
     claims = [
@@ -334,31 +305,33 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     )
 
 
-def _margins(rows: Sequence[Row]) -> list[float]:
-    """Return bound over truncation error of both quantities, where that error is not zero."""
-    return [r[f"{name}_bound"] / r[name] for r in rows for name, _, _ in QUANTITIES if r[name]]
+def _margins(rows: Sequence[Row], name: str) -> list[float]:
+    """Return bound over truncation error of a quantity, where that error is not zero."""
+    return [r[f"{name}_bound"] / r[name] for r in rows if r[name]]
 
 
 def _quantiles(rows: Sequence[Row], name: str) -> list[float | None]:
-    ratios = [r[f"{name}_bound"] / r[name] for r in rows if r[name]]
+    ratios = _margins(rows, name)
     if not ratios:
         return [None] * 4
     return [float(v) for v in np.quantile(ratios, [0.0, 0.1, 0.5, 0.9])]
 
 
-def _table(name: str, caption: str, rows: Sequence[Row], key: Callable[[Row], str]) -> Table | None:
-    if not rows:
-        return None
-    groups: dict[str, list[Row]] = {}
-    for row in sorted(rows, key=lambda r: r["order"]):
-        groups.setdefault(key(row), []).append(row)
-    lines = []
-    for group, found in groups.items():
+def _tightness_table(rows: Sequence[Row]) -> Table | None:
+    lines: list[list[Any]] = []
+    for order in sorted({r["order"] for r in rows}):
+        found = [r for r in rows if r["order"] == order]
         angle, speed = _quantiles(found, "theta"), _quantiles(found, "theta_dot")
-        per_power = speed[2] and speed[2] ** (1.0 / (found[0]["order"] + 1))
-        lines.append([group, len(found), *angle, *speed, per_power])
+        per_power = speed[2] and speed[2] ** (1.0 / (order + 1))
+        lines.append([f"order {order}", len(found), *angle, *speed, per_power])
     parts = [f"{sign}: {q}" for _, sign, _ in QUANTITIES for q in ("least", "10 %", "50 %", "90 %")]
-    return Table(name, caption, ["series", "steps", *parts, "per power"], lines)
+    caption = (
+        "Bound over truncation error of one step, both in exact arithmetic, for random drives. It is never "
+        "below 1 if the bound is never broken. 50 % is the median. Per power: the (order + 1)th root of the "
+        "median for θ', the factor by which the bound overestimates the step's length."
+    )
+    columns = ["series", "steps", *parts, "per power"]
+    return Table("bound-tightness", caption, columns, lines) if lines else None
 
 
 def _reach_table(steps: Sequence[Row], reaches: Sequence[Row]) -> Table | None:
@@ -368,13 +341,11 @@ def _reach_table(steps: Sequence[Row], reaches: Sequence[Row]) -> Table | None:
     lines = []
     for id in dict.fromkeys(r["id"] for r in [*steps, *reaches]):
         found = [r for r in steps if r["id"] == id]
-        order, dt = (known.get(id) or found[0])["order"], (known.get(id) or found[0])["dt"]
+        about = known.get(id) or found[0] | {"certified": found[0]["reach"], "actual": None}
         least, _, median, _ = _quantiles(found, "theta_dot")
         worst = max((r["theta_dot"] for r in found), default=None)
-        certified = known[id]["certified"] if id in known else found[0]["reach"]
-        certified = math.floor(10.0 * certified) / 10.0  # as in README and the pages
-        actual = known[id]["actual"] if id in known else None
-        lines.append([id, dt, order, certified, actual, worst, least, median])
+        certified = math.floor(10.0 * about["certified"]) / 10.0  # as in README and the pages
+        lines.append([id, about["dt"], about["order"], certified, about["actual"], worst, least, median])
     return Table(
         "bound-environments",
         "Each environment with a pendulum: the speed up to which one series per step is certified to have "

@@ -106,10 +106,8 @@ def scales(case: Case, dt: float) -> list[float]:
     from lag_envs.report.stepped import Stepped
 
     scene, state, u = case
-    stepped = Stepped(scene)
-    y, k = stepped.lift(np.asarray(state)), stepped.numbers()
-    coefficients = stepped.drive(y, u, k, np)
-    q, v = (float(x) for x in stepped.unpack(y, u, k)[:2])
+    variables, coefficients = Stepped(scene).at(state, u)
+    q, v = map(float, variables[:2])
     gain = EQUATIONS[type(coefficients)].field(coefficients, scene, dt)
     place, rate = max(1.0, abs(q), abs(v) * dt), max(1.0, abs(v), gain)
     return [rate if unit.endswith("/s") else place for unit in scene.state_units]

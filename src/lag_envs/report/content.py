@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,30 @@ class Table:
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
+
+    @classmethod
+    def of(
+        cls, name: str, caption: str, columns: Mapping[str, str | Callable[[Any], Any]], found: Iterable[Any]
+    ) -> Table:
+        """Return a table with a line for each thing found.
+
+        A column shows an entry of it, or what a function returns for it.
+
+        Examples
+        --------
+        >>> columns = {"scene": "name", "error [%]": lambda row: 100.0 * row["error"]}
+        >>> Table.of("errors", "Errors.", columns, [{"name": "bar", "error": 0.5}]).rows
+        [['bar', 50.0]]
+        """
+        cells = [
+            [row[get] if isinstance(get, str) else get(row) for get in columns.values()] for row in found
+        ]
+        return cls(name, caption, list(columns), cells)
+
+    def part(self, name: str, caption: str, columns: Sequence[str]) -> Table:
+        """Return a table of some of its columns."""
+        places = [list(self.columns).index(column) for column in columns]
+        return Table(name, caption, columns, [[row[i] for i in places] for row in self.rows])
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lag_envs.report.points import HORIZONS, MODES, WorkPrecisionPoint
@@ -58,16 +58,17 @@ def draw_variant(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapp
         row[0].set_ylabel("largest error, relative")
     for ax in axes[-1]:
         ax.set_xlabel("time of a control step [ns]")
-    known = {
-        label: handle
-        for ax in axes.flat
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
+    known = labelled_lines(axes.flat)
     names = [name for name in (*OWN_STYLES, *STYLES, ROUNDED) if name in known]
     figure.legend(
         [known[n] for n in names], names, loc="outside lower center", ncols=6, fontsize=8.5, frameon=False
     )
     return figure
+
+
+def labelled_lines(panels: Iterable[Axes]) -> dict[str, Any]:
+    """Return a line for each label in the panels."""
+    return {label: line for ax in panels for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
 
 
 def panel(ax: Axes, points: Sequence[WorkPrecisionPoint], floor: float | None) -> None:

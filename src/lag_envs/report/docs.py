@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.options import module_parser
 from lag_envs.report import overview, page
-from lag_envs.report.content import ReportFigure, Table
+from lag_envs.report.content import ReportFigure
 from lag_envs.report.report import FILE, content_of
 from lag_envs.store import write_file
 from lag_envs.tables import markdown_table
@@ -231,15 +231,13 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
                 lines += ["", *_picture(picture)]
         if section["summary"]:
             lines += ["", _table(section["summary"])]
-        holding = sum(claim["holds"] is True for claim in section["claims"])
-        lines += ["", f"{holding} of {len(section['claims'])} claims hold.", "", *_command(part.section)]
+        lines += ["", f"{_holding(section['claims'])}.", "", *_command(part.section)]
         lines += [f"[Method, all tables and figures]({DETAILS}#{_anchor(section['title'])})"]
     lines += [
         "",
         "## What does not hold",
         "",
-        f"{sum(claim['holds'] is True for claim in claims)} of {len(claims)} claims hold"
-        + (". These do not:" if broken else "."),
+        _holding(claims) + (". These do not:" if broken else "."),
         *([""] if broken else []),
         *(f"- {claim['text']} ({claim['evidence']})" for claim in broken),
         "",
@@ -300,6 +298,10 @@ def details(accuracy: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _holding(claims: Sequence[dict[str, Any]]) -> str:
+    return f"{sum(claim['holds'] is True for claim in claims)} of {len(claims)} claims hold"
+
+
 def _picture(picture: dict[str, str]) -> list[str]:
     alt = picture["caption"].partition(". ")[0]
     return [f"![{alt}]({FIGURES}/{picture['file']})", "", f"*{picture['caption']}*"]
@@ -324,11 +326,8 @@ def _anchor(title: str) -> str:
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
-def _table(table: dict[str, Any] | Table) -> str:
-    parts = vars(table) if isinstance(table, Table) else table
-    return markdown_table(
-        parts["columns"], [[page.cell_text(value) for value in row] for row in parts["rows"]]
-    )
+def _table(table: dict[str, Any]) -> str:
+    return markdown_table(table["columns"], [list(map(page.cell_text, row)) for row in table["rows"]])
 
 
 if __name__ == "__main__":

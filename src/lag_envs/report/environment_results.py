@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.episodes import DIGITS, TIMES
@@ -37,7 +38,7 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     cases = {case: [r for r in rows if r["case"] == case] for case in dict.fromkeys(r["case"] for r in rows)}
     episodes = {case: group for case, group in cases.items() if group[0]["seed"] is not None}
-    free = {case: group for case, group in cases.items() if group[0]["seed"] is None}
+    free = [r for r in rows if r["seed"] is None]
     failed = {result.name: result.problem or "" for result in problems}
     pictures = []
     if episodes:
@@ -128,39 +129,30 @@ def _span(values: Sequence[float]) -> str:
 
 
 def _cases_table(episodes: dict[str, list[Row]], failed: dict[str, str]) -> Table:
-    lines: list[list[Any]] = []
-    for case, group in episodes.items():
-        ends = [r["error"]["the end"] for r in group]
-        lines.append(
-            [
-                case,
-                group[0]["integrator"],
-                group[0]["dt"],
-                len(group),
-                _span([r["seconds"] for r in group]),
-                *(_largest([r["error"][mark] for r in group]) for mark in MARKS[:-1]),
-                median(ends),
-                max(ends),
-                max(r["amplified"]["the end"] for r in group),
-                max(_ratio(r) for r in group),
-                "",
-            ]
-        )
-    columns = [
-        *("environment", "integrator", "dt [s]", "episodes", "length [s]"),
-        *map(_column, MARKS[:-1]),
-        *("whole episode, median", "whole episode, largest"),
-        *("amplified rounding", "error over amplified rounding", "problem"),
-    ]
-    empty = [None] * (len(columns) - 2)
-    lines += [[name, *empty, problem] for name, problem in failed.items()]
-    return Table(
+    def at(mark: str) -> Callable[[list[Row]], float | None]:
+        return lambda group: _largest([r["error"][mark] for r in group])
+
+    table = Table.of(
         "environment-errors",
         "Errors relative to the size of the state. Largest over the episodes unless stated otherwise; "
         "empty if an episode had ended before.",
-        columns,
-        lines,
+        {
+            "environment": lambda group: group[0]["case"],
+            "integrator": lambda group: group[0]["integrator"],
+            "dt [s]": lambda group: group[0]["dt"],
+            "episodes": len,
+            "length [s]": lambda group: _span([r["seconds"] for r in group]),
+            **{_column(mark): at(mark) for mark in MARKS[:-1]},
+            "whole episode, median": lambda group: median(r["error"]["the end"] for r in group),
+            "whole episode, largest": at("the end"),
+            "amplified rounding": lambda group: max(r["amplified"]["the end"] for r in group),
+            "error over amplified rounding": lambda group: max(map(_ratio, group)),
+            "problem": lambda group: "",
+        },
+        episodes.values(),
     )
+    empty = [None] * (len(table.columns) - 2)
+    return replace(table, rows=[*table.rows, *([name, *empty, problem] for name, problem in failed.items())])
 
 
 def _entries_table(cases: dict[str, list[Row]]) -> Table:
@@ -179,11 +171,11 @@ def _entries_table(cases: dict[str, list[Row]]) -> Table:
     )
 
 
-def _free_table(free: dict[str, list[Row]]) -> Table:
+def _free_table(free: list[Row]) -> Table:
     lines = []
-    for case, row in ((case, row) for case, group in free.items() for row in group):
+    for row in free:
         angle = next(e for e in row["entries"] if e["name"] == "theta")
-        steps = [case, row["integrator"], row["dt"], angle["one step"], angle["1 s"], angle["10 s"]]
+        steps = [row["case"], row["integrator"], row["dt"], angle["one step"], angle["1 s"], angle["10 s"]]
         lines.append([*steps, row["amplified"]["10 s"], _ratio(row), 100.0 * row["gain"]])
     return Table(
         "environment-undriven",
@@ -214,27 +206,22 @@ def _details(rows: list[Row]) -> Table:
 
 
 def _summary(episodes: dict[str, list[Row]]) -> Table | None:
-    lines = [
-        [
-            case,
-            group[0]["integrator"],
-            _largest([r["error"]["one step"] for r in group]),
-            max(r["error"]["the end"] for r in group),
-            _span([r["seconds"] for r in group]),
-            max(_ratio(r) for r in group),
-        ]
-        for case, group in episodes.items()
-    ]
-    if not lines:
-        return None
-    return Table(
+    table = Table.of(
         "environments",
         "Error against the exact motion under the same controls, relative to the size of the state; the "
         "largest over random episodes. One step: the largest over all of their steps. Last column: the "
         "error over one rounding of the start as amplified by the system.",
-        ["environment", "integrator", "one step", "whole episode", "length [s]", "error / rounding floor"],
-        lines,
+        {
+            "environment": lambda group: group[0]["case"],
+            "integrator": lambda group: group[0]["integrator"],
+            "one step": lambda group: _largest([r["error"]["one step"] for r in group]),
+            "whole episode": lambda group: max(r["error"]["the end"] for r in group),
+            "length [s]": lambda group: _span([r["seconds"] for r in group]),
+            "error / rounding floor": lambda group: max(map(_ratio, group)),
+        },
+        episodes.values(),
     )
+    return table if table.rows else None
 
 
 def _claims(rows: list[Row]) -> list[Claim]:

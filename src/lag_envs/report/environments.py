@@ -22,7 +22,6 @@ from lag_envs.report.episodes import (
     DIGITS,
     RecordedEpisode,
     endless_actions,
-    entry_errors,
     episode_errors,
     exact_states,
     exact_stepping,
@@ -65,16 +64,11 @@ def jobs(quick: bool) -> list[ReportJob]:
         for id in PEERS
         for seed in (seeds[:3] if id == "Acrobot-v1" else seeds)  # its episodes last 100 s
     ]
-    free: list[dict[str, Any]] = [{"id": id} for id in ("", *UNDRIVEN)]
+    free: dict[str, dict[str, Any]] = {"lag_envs, undriven": {"id": ""}}
     if not quick:
-        free.insert(1, {"id": "", "dt": 0.02})
-    names = [
-        f"{f['id'] or 'lag_envs'}, undriven" + (f", dt {f['dt']:g} s" if "dt" in f else "") for f in free
-    ]
-    return made + [
-        ReportJob(SECTION, name, "environments:undriven", arguments)
-        for name, arguments in zip(names, free, strict=True)
-    ]
+        free["lag_envs, undriven, dt 0.02 s"] = {"id": "", "dt": 0.02}
+    free |= {f"{id}, undriven": {"id": id} for id in UNDRIVEN}
+    return made + [ReportJob(SECTION, name, "environments:undriven", given) for name, given in free.items()]
 
 
 def longest(task: Task) -> float | None:
@@ -101,9 +95,11 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
         return exact_states(task, seed, start, episode.controls, digits)
 
-    path, step = exact(episode.states[0]), exact_stepping(task, seed, DIGITS)
-    alone = [step(y, i, u) for i, (y, u) in enumerate(zip(episode.states, episode.controls, strict=False), 1)]
-    row = episode_errors(episode, path, exact(moved_start(episode.states), DIGITS - 10), alone, task.dt)
+    path, shifted = exact(episode.states[0]), exact(moved_start(episode.states), DIGITS - 10)
+    entries = list(zip(task.scene.state_names, task.scene.state_units, strict=True))
+    row = episode_errors(episode, exact_stepping(task, seed, DIGITS), path, shifted, task.dt, entries)
+    order = order_of(task.scene, task.dt)
+    row |= {"own": True, "integrator": f"Taylor series, order {order}" if order else "exact flow"}
     if vouch:
         row["disagreement"] = float(
             max(
@@ -112,12 +108,6 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
                 for a, b in zip(x, y, strict=True)
             )
         )
-    order = order_of(task.scene, task.dt)
-    row |= {
-        "own": True,
-        "integrator": f"Taylor series, order {order}" if order else "exact flow",
-        "entries": entry_errors(row.pop("each"), task.scene.state_names, task.scene.state_units),
-    }
     return row
 
 

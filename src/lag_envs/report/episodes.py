@@ -25,6 +25,8 @@ from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
+#: Takes an exact step from a state, with a number from 1 and a control.
+ExactStep = Callable[[Sequence[Any], int, float], list[mpf]]
 
 DIGITS = 34
 #: Errors are given up to these times [s], and up to the end.
@@ -58,8 +60,8 @@ def endless_actions(env: gym.Env, seed: int) -> Iterator[Any]:
         yield env.action_space.sample()
 
 
-def exact_stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int, float], list[mpf]]:
-    """Return a function for exact steps of our environment, from a state, with a number from 1 and a control.
+def exact_stepping(task: Task, seed: int, digits: int) -> ExactStep:
+    """Return the exact step of our environment.
 
     Kicks are those of the first episode after a reset with that seed, from the task's own formula and the
     environment's own random numbers, which are a function of seed, episode and step. They are multiples of
@@ -84,8 +86,12 @@ def exact_states(
     task: Task, seed: int, start: Sequence[Any], controls: Sequence[float], digits: int
 ) -> list[list[mpf]]:
     """Return the exact states of one of our episodes: the first one after a reset with that seed."""
-    step = exact_stepping(task, seed, digits)
-    path = [[mpf(x) for x in start]]
+    return chained(exact_stepping(task, seed, digits), [mpf(x) for x in start], controls)
+
+
+def chained(step: ExactStep, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
+    """Return the states from a start under controls, without rounding in between."""
+    path = [list(start)]
     for number, control in enumerate(controls, start=1):
         path.append(step(path[-1], number, control))
     return path
@@ -107,26 +113,30 @@ def moved_start(states: Array) -> list[mpf]:
 
 def episode_errors(
     episode: RecordedEpisode,
+    step: ExactStep,
     path: list[list[mpf]],
     shifted: list[list[mpf]],
-    alone: list[list[mpf]],
     dt: float,
+    entries: Sequence[tuple[str, str]],
     wraps: Sequence[int] = (),
 ) -> Row:
-    """Return errors and amplified rounding, each the largest up to a time, relative to the states' sizes.
+    """Return errors and amplified rounding, each the largest up to a time.
 
-    "one step" is the largest error of any single step of the episode.
+    Those of the "entries" are in their units, all others relative to the states' sizes. "one step" is the
+    largest error of any single step of the episode.
 
     Parameters
     ----------
     episode : Episode
         The recorded episode.
+    step : callable
+        Repeats every step by itself, from the recorded state.
     path, shifted : list of list of mpf
         The exact states from the same start, and from the start moved by a rounding.
-    alone : list of list of mpf
-        For each step, the exact state at its end, from the recorded state at its start.
     dt : float
         Control step [s].
+    entries : sequence of (str, str)
+        Names and units of the state's entries.
     wraps : sequence of int
         Entries that the environment wraps into [-π, π].
     """
@@ -138,6 +148,7 @@ def episode_errors(
             each[:, i] = np.remainder(each[:, i] + math.pi, 2.0 * math.pi) - math.pi
         return np.abs(each)
 
+    alone = [step(y, i, u) for i, (y, u) in enumerate(zip(states, episode.controls, strict=False), start=1)]
     up_to = np.maximum.accumulate(errors(states, path))
     one = errors(states[1:], alone).max(axis=0)
     with mp.workdps(60):
@@ -149,8 +160,8 @@ def episode_errors(
     steps = len(episode.controls)
     marks = {**{f"{t:g} s": round(t / dt) for t in TIMES}, "the end": steps}
 
-    def pairs(values: Array) -> list[list[float]]:
-        return [[float(a), float(s)] for a, s in zip(values, scale, strict=True)]
+    def marked(values: Array) -> dict[str, float | None]:
+        return {name: float(values[i]) if i <= steps else None for name, i in marks.items()}
 
     points = np.unique(np.geomspace(1, steps, POINTS).round().astype(int))
     return {
@@ -158,19 +169,11 @@ def episode_errors(
         "steps": steps,
         "seconds": steps * dt,
         "terminated": episode.terminated,
-        "error": {"one step": float((one / scale).max())}
-        | {name: float(error[i]) if i <= steps else None for name, i in marks.items()},
-        "amplified": {name: float(amplified[i]) if i <= steps else None for name, i in marks.items()},
+        "error": {"one step": float((one / scale).max()), **marked(error)},
+        "amplified": marked(amplified),
         "curve": [[float(i * dt), float(error[i]), float(amplified[i])] for i in points],
-        "each": {"one step": pairs(one)}
-        | {name: pairs(up_to[i]) if i <= steps else None for name, i in marks.items()},
+        "entries": [
+            {"name": name, "unit": unit, "size": float(size), "one step": float(worst), **marked(each)}
+            for (name, unit), size, worst, each in zip(entries, scale, one, up_to.T, strict=True)
+        ],
     }
-
-
-def entry_errors(each: dict[str, Any], names: Sequence[str], units: Sequence[str]) -> list[Row]:
-    """Return for each state entry its name, unit, size, and the error up to each mark in that unit."""
-    return [
-        {"name": name, "unit": unit, "size": each["the end"][i][1]}
-        | {mark: values and values[i][0] for mark, values in each.items()}
-        for i, (name, unit) in enumerate(zip(names, units, strict=True))
-    ]

@@ -171,8 +171,7 @@ def _floor(case: Case, entry: int) -> float:
     if scene.state_units[entry] == "rad":
         return 1.0
     if scene.state_names[entry] == "theta_dot":
-        stepped = Stepped(scene)
-        drive = stepped.drive(stepped.lift(np.asarray(state)), control, stepped.numbers(), np)
+        _, drive = Stepped(scene).at(state, control)
         return math.sqrt(math.hypot(drive[0], drive[1]))
     return 0.0
 

@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from time import process_time
 from typing import Any
@@ -51,16 +51,14 @@ CERTIFIED: Sequence[tuple[float, int]] = tuple(
     if -math.log10(tolerance) <= order <= 6.0 - 2.0 * math.log10(tolerance)
 )
 #: Settings of the other methods.
-SUBSTEPS = {
-    "RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256, 512),
-    "DOP853": (1, 2, 3, 4, 6, 8, 12, 16, 32),
-    CompiledRadau.METHOD: (1, 2, 4, 8, 16, 32, 64),
-}
+RK4: Sequence[int] = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+DOP853: Sequence[int] = (1, 2, 3, 4, 6, 8, 12, 16, 32)
+RADAU: Sequence[int] = (1, 2, 4, 8, 16, 32, 64)
 #: Step lengths at which the certificate is tried [s].
 LENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1)
 FAMILIES = ("compiled", "heyoka", *ENGINES)
-#: Tolerance and order of the clock, which is timed in turn with every job's samples.
-CLOCK = (1e-12, 16)
+#: Timed in turn with every job's samples.
+CLOCK = CertifiedSeries(16, 1e-12)
 #: Seconds over which energy is recorded.
 LONG = 1000.0
 #: Prints the seconds that a scene takes to its first step.
@@ -159,15 +157,16 @@ def system_rivals(family: str, quick: bool) -> list[Rival]:
     if family in ENGINES:
         kind = ENGINES[family]
         return [kind(method, n) for method, found in kind.settings.items() for n in found[some]]
-    certified_series = [
-        CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
-        for tolerance, order in CERTIFIED[slice(-1, None, -25) if quick else some]
-    ]
-    others = [CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in SUBSTEPS[method][some]]
+    return compiled_rivals(CERTIFIED[slice(-1, None, -25) if quick else some], some)
+
+
+def compiled_rivals(certified: Sequence[tuple[float, int]], some: slice) -> list[Rival]:
+    """Return lag_envs at tolerances and orders, and the usual integrators at some of their settings."""
     return [
-        *certified_series,
-        *others,
-        *(CompiledRadau(CompiledRadau.METHOD, n) for n in SUBSTEPS[CompiledRadau.METHOD][some]),
+        *(CertifiedSeries(order, tolerance) for tolerance, order in certified),
+        *(CompiledMethod("RK4", n) for n in RK4[some]),
+        *(CompiledMethod("DOP853", n) for n in DOP853[some]),
+        *(CompiledRadau(n) for n in RADAU[some]),
     ]
 
 
@@ -180,24 +179,20 @@ def system_points(name: str, family: str, quick: bool) -> Iterator[Row]:
     problems = SceneProblems(
         system.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)), system
     )
-    clock = CertifiedSeries(CertifiedSeries.method_of(CLOCK[1]), CLOCK[0])
     for mode in MODES:
-        yield from timed_rivals(
-            problems, truth, system_rivals(family, quick), clock, mode, 3 if quick else 9, {"system": name}
-        )
+        yield from timed_rivals(name, problems, truth, system_rivals(family, quick), mode, 3 if quick else 9)
 
 
 def timed_rivals(
+    name: str,
     problems: SceneProblems,
     truth: tuple[Array, Array],
     some: Sequence[Rival],
-    clock: Rival,
     mode: str,
     rounds: int,
-    about: Mapping[str, Any],
     dt: float = DT,
 ) -> Iterator[Row]:
-    """Yield errors and times of rivals, for calls with all states, timed in turn with a clock."""
+    """Yield errors and times of rivals, for calls with all states, timed in turn with the clock."""
     together = mode == "batch"
     found: list[Row] = []
     samples: list[Sample] = []
@@ -206,7 +201,7 @@ def timed_rivals(
             continue
         row = {
             "kind": "point", "mode": mode, "family": rival.family, "method": rival.method,
-            "setting": rival.setting, "batched": rival.batched, **about,
+            "setting": rival.setting, "batched": rival.batched, "system": name,
         }  # fmt: skip
         try:
             sample = rival.build(problems, dt, 1, together)
@@ -218,10 +213,10 @@ def timed_rivals(
         else:
             found.append(row | {"error": worst, "median": typical})
             samples.append(again(sample))
-    shown = [again(clock.build(problems, dt, 1, together)), *samples]
-    times = interleaved(dict(enumerate(shown)), rounds, process_time)
-    for i, row in enumerate(found):
-        yield row | {"ns": times[i + 1], "clock": times[0]}
+    clock = again(CLOCK.build(problems, dt, 1, together))
+    own, *times = interleaved([clock, *samples], rounds, process_time)
+    for row, ns in zip(found, times, strict=True):
+        yield row | {"ns": ns, "clock": own}
 
 
 def worst_and_median(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:
@@ -299,15 +294,11 @@ def first_step_seconds(name: str, rounds: int) -> Iterator[Row]:
                 )  # fmt: skip
                 yield {"kind": "first", "system": name, "what": kind, "seconds": float(done.stdout)}
     for mode in MODES:
+        row = {"kind": "first", "system": name, "what": f"heyoka, {mode}"}
         try:
-            yield {
-                "kind": "first",
-                "system": name,
-                "what": f"heyoka, {mode}",
-                "seconds": _heyoka(system, mode),
-            }
+            yield row | {"seconds": _heyoka(system, mode)}
         except ImportError as error:
-            yield {"kind": "first", "system": name, "what": f"heyoka, {mode}", "problem": error_line(error)}
+            yield row | {"problem": error_line(error)}
             return
 
 

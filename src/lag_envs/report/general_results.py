@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
+from lag_envs.report.diagrams import labelled_lines
 from lag_envs.report.linkages import SYSTEMS
 from lag_envs.report.motions import CertifiedSeries
-from lag_envs.report.points import MODES, TARGETS
+from lag_envs.report.points import LIBRARIES, MODES, TARGETS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.series import TOLERANCE
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 DT, MEMBERS = 0.02, 200
 #: Orders at which the certificate is tried.
 CERTIFIED_ORDERS = (12, 14, 16, 18, 20, 22)
-LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "compiled": "compiled"}
 #: Largest difference of equal models, and largest loss of energy, relative.
 EQUAL, DRIFT = 1e-12, 1e-9
 
@@ -50,7 +50,7 @@ def column_name(row: Row) -> str:
         return "lag_envs"
     if row["family"] == "compiled":
         return f"{row['method']}, compiled"
-    return LABELS[row["family"]]
+    return LIBRARIES[row["family"]]
 
 
 #: The rivals to compare with, and their columns.
@@ -91,7 +91,7 @@ def best_settings(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str,
 def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
     """Return the content: times at equal errors, equality of models, certificates, first steps, energy."""
     found = best_settings(rows)
-    missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
+    absent = missing(rows)
     fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
     claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
     pictures = [
@@ -105,7 +105,7 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
         for name in SYSTEMS
         if any(r["kind"] == "point" and r["system"] == name for r in rows)
     ]
-    tables = [best_times(found, mode) for mode in MODES]
+    tables = [best_times("general", found, mode) for mode in MODES]
     tables += [_models(rows), _shares(rows), _first(rows), _energy(rows)]
     return Content(
         "Any Lagrangian",
@@ -126,15 +126,20 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
             "algorithm in RK4 steps in a C++ loop. For both, a driven support is a field in its frame. RK4, "
             "DOP853 and Radau IIA take fixed steps and are compiled like lag_envs.",
-            *([f"Not compared: {', '.join(missing)}."] if missing else []),
+            *([f"Not compared: {absent}."] if absent else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
         [t for t in tables if t.rows],
         pictures,
         claims,
         summary=_summary(found),
-        details=[all_points(rows)],
+        details=[all_points("general-points", rows)],
     )
+
+
+def missing(rows: Sequence[Row]) -> str:
+    """Return the libraries that are not installed."""
+    return ", ".join(sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")}))
 
 
 def file_part(name: str) -> str:
@@ -146,11 +151,7 @@ def verdict(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> str:
     """Summarise for each column how it compares at equal error."""
     parts = []
     for name in COLUMNS:
-        ratios = [
-            here[name].ns / here["lag_envs"].ns
-            for (_, of, _), here in found.items()
-            if of == mode and name in here and "lag_envs" in here
-        ]
+        ratios = [here[name].ns / here["lag_envs"].ns for _, _, here in _cases(found, mode) if name in here]
         if not ratios:
             continue
         worst, wins = min(ratios), sum(r < 1.0 for r in ratios)
@@ -163,28 +164,35 @@ def verdict(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> str:
     )
 
 
+def _cases(
+    found: Mapping[tuple, Mapping[str, BestSetting]], mode: str
+) -> list[tuple[str, float, Mapping[str, BestSetting]]]:
+    """Return system, error and quickest settings where lag_envs is among them."""
+    return [
+        (name, error, here) for (name, of, error), here in found.items() if of == mode and "lag_envs" in here
+    ]
+
+
 def _cell(here: Mapping[str, BestSetting], name: str) -> float | None:
     return round(here[name].ns, 1) if name in here else None
 
 
-def _others(here: Mapping[str, BestSetting]) -> list[tuple[float, str]]:
-    return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
+def _others(here: Mapping[str, BestSetting]) -> list[str]:
+    """Return the columns of others, the quickest first."""
+    return sorted((name for name in here if name != "lag_envs"), key=lambda name: (here[name].ns, name))
 
 
-def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
+def best_times(section: str, found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> Table:
     """Return the quickest setting of each column, by system and error."""
     rows = []
-    for (system, of, target), here in found.items():
-        if of != mode or "lag_envs" not in here:
-            continue
-        others, own = _others(here), here["lag_envs"]
-        ratio = others[0][0] / own.ns if others else None
+    for system, target, here in _cases(found, mode):
+        own, quickest = here["lag_envs"], next(iter(_others(here)), None)
         rows.append((
             system, f"{target:g}", round(own.ns, 1), own.label, *(_cell(here, name) for name in COLUMNS),
-            ratio, f"{others[0][1]}: {here[others[0][1]].label}" if others else None,
+            quickest and here[quickest].ns / own.ns, quickest and f"{quickest}: {here[quickest].label}",
         ))  # fmt: skip
     return Table(
-        f"general-times-{mode}",
+        f"{section}-times-{mode}",
         f"CPU time of a control step [ns] {MODES[mode]}, each at its quickest setting whose worst error is "
         "below the one given; the ratio is that of the quickest other to lag_envs, below 1 where the other "
         "is faster",
@@ -203,8 +211,8 @@ def best_times(found: Mapping[tuple, Mapping[str, BestSetting]], mode: str) -> T
 
 def _summary(found: Mapping[tuple, Mapping[str, BestSetting]]) -> Table | None:
     rows = []
-    for (system, mode, target), here in found.items():
-        if mode == "single" and target in (1e-6, 1e-12) and "lag_envs" in here:
+    for system, target, here in _cases(found, "single"):
+        if target in (1e-6, 1e-12):
             together = found[system, "batch", target]
             cells = [_cell(here, name) for name in COLUMNS[:5]]
             rows.append((system, f"{target:g}", _cell(here, "lag_envs"), _cell(together, "lag_envs"), *cells,
@@ -232,8 +240,9 @@ def _equal(rows: Sequence[Row]) -> Claim:
 
 
 def _accurate(rows: Sequence[Row]) -> Claim:
-    shipped = TOLERANCE, CertifiedSeries.method_of(usual_order(DT))
-    found = [r for r in rows if r["kind"] == "point" and (r["setting"], r["method"]) == shipped]
+    shipped = CertifiedSeries(usual_order(DT), TOLERANCE)
+    key = shipped.method, shipped.setting
+    found = [r for r in rows if r["kind"] == "point" and (r["method"], r["setting"]) == key]
     worst = max((math.inf if r["error"] is None else r["error"] for r in found), default=0.0)
     return Claim(
         "At the shipped tolerance and order, a step from a harsh state errs by less than 1e-12.",
@@ -246,14 +255,14 @@ def _fastest(
     found: Mapping[tuple, Mapping[str, BestSetting]], mode: str, who: str, names: Sequence[str]
 ) -> Claim:
     lost, cases = [], 0
-    for (system, of, target), here in found.items():
-        others = [(ns, name) for ns, name in _others(here) if name in names]
-        if of != mode or "lag_envs" not in here or not others:
+    for system, target, here in _cases(found, mode):
+        name = next((name for name in _others(here) if name in names), None)
+        if name is None:
             continue
         cases += 1
-        ns, name = others[0]
-        if ns < here["lag_envs"].ns:
-            lost.append(f"{name} by {here['lag_envs'].ns / ns:.2f} ({system}, {target:g})")
+        own, ns = here["lag_envs"].ns, here[name].ns
+        if ns < own:
+            lost.append(f"{name} by {own / ns:.2f} ({system}, {target:g})")
     told = f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else "")
     return Claim(
         f"lag_envs reaches each error in less time than {who}, {MODES[mode]}.",
@@ -272,16 +281,17 @@ def _conserved(rows: Sequence[Row]) -> Claim:
 
 
 def _models(rows: Sequence[Row]) -> Table:
-    return Table(
+    return Table.of(
         "general-models",
         "Other engines' models against Lagrange's equations by SymPy, at 50 random states: largest "
         "differences, relative",
-        ("system", "engine", "mass matrix", "acceleration"),
-        [
-            (r["system"], LABELS[r["engine"]], r.get("mass", r.get("problem")), r.get("acceleration"))
-            for r in rows
-            if r["kind"] == "model"
-        ],
+        {
+            "system": "system",
+            "engine": lambda r: LIBRARIES[r["engine"]],
+            "mass matrix": lambda r: r.get("mass", r.get("problem")),
+            "acceleration": lambda r: r.get("acceleration"),
+        },
+        [r for r in rows if r["kind"] == "model"],
     )
 
 
@@ -320,28 +330,24 @@ def _first(rows: Sequence[Row]) -> Table:
 
 
 def _energy(rows: Sequence[Row]) -> Table:
-    return Table(
+    return Table.of(
         "general-energy",
         "Energy of undamped double pendulums: largest drift, relative to its height above the lowest "
         "energy; lag_envs over the whole time, the others at the end",
-        ("method", "seconds", "drift"),
-        [
-            (r["method"], r["seconds"], "lost" if r["drift"] is None else r["drift"])
-            for r in rows
-            if r["kind"] == "energy"
-        ],
+        {
+            "method": "method",
+            "seconds": "seconds",
+            "drift": lambda r: "lost" if r["drift"] is None else r["drift"],
+        },
+        [r for r in rows if r["kind"] == "energy"],
     )
 
 
-def all_points(rows: Sequence[Row]) -> Table:
+def all_points(name: str, rows: Sequence[Row]) -> Table:
     """Return every setting of every method."""
     names = ("system", "mode", "family", "method", "setting", "error", "median", "ns", "clock", "problem")
-    return Table(
-        "general-points",
-        "All points",
-        names,
-        [[r.get(name) for name in names] for r in rows if r["kind"] == "point"],
-    )
+    points = [r for r in rows if r["kind"] == "point"]
+    return Table(name, "All points", names, [[r.get(entry) for entry in names] for r in points])
 
 
 #: Colours after Okabe and Ito.
@@ -389,10 +395,8 @@ def draw_times(name: str, rows: Sequence[Row]) -> Figure:
                     label=title,
                 )
     figure.axes[0].set_ylabel("worst error, relative")
-    handles = {
-        text: line for ax in figure.axes for line, text in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
+    lines = labelled_lines(figure.axes)
     figure.legend(
-        list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False
+        list(lines.values()), list(lines), loc="outside lower center", ncols=7, fontsize=8, frameon=False
     )
     return figure

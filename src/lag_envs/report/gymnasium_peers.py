@@ -15,9 +15,10 @@ from mpmath import mpf
 
 from lag_envs.report.episodes import (
     DIGITS,
+    ExactStep,
     RecordedEpisode,
+    chained,
     endless_actions,
-    entry_errors,
     episode_errors,
     moved_start,
 )
@@ -38,10 +39,10 @@ class GymnasiumPeer(NamedTuple):
     wraps: Sequence[int] = ()
     limits: Callable[[Any], Sequence[float]] = lambda env: ()  #: at these speeds it clips the last entries
 
-    def described(self, env: Any) -> tuple[list[str], list[str]]:
+    def entries(self, env: Any) -> list[tuple[str, str]]:
         """Return names and units of its state."""
-        scene, own = self.scene(env), np.argsort(self.order)
-        return [scene.state_names[i] for i in own], [scene.state_units[i] for i in own]
+        scene = self.scene(env)
+        return [(scene.state_names[i], scene.state_units[i]) for i in np.argsort(self.order)]
 
 
 PEERS = {
@@ -108,26 +109,20 @@ def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[An
 
 def measure_peer(env: Any, peer: GymnasiumPeer, episode: RecordedEpisode) -> Row:
     """Return the row of a peer's episode against the exact one."""
-    dt = peer.step(env)
-    path = solve_peer(env, peer, episode.states[0], episode.controls)
-    shifted = solve_peer(env, peer, moved_start(episode.states), episode.controls)
-    alone = [
-        solve_peer(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)
-    ]
-    row = episode_errors(episode, path, shifted, alone, dt, peer.wraps)
-    return row | {
-        "own": False,
-        "integrator": peer.integrator,
-        "entries": entry_errors(row.pop("each"), *peer.described(env)),
-    }
+    step = exact_peer_step(env, peer)
+    path, shifted = (
+        chained(step, start, episode.controls) for start in (episode.states[0], moved_start(episode.states))
+    )
+    row = episode_errors(episode, step, path, shifted, peer.step(env), peer.entries(env), peer.wraps)
+    return row | {"own": False, "integrator": peer.integrator}
 
 
-def solve_peer(
-    env: Any, peer: GymnasiumPeer, start: Sequence[Any], controls: Sequence[float]
-) -> list[list[mpf]]:
-    """Return the exact states of a peer's equations of motion, each control held for one step."""
-    oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
-    path = [[x if isinstance(x, mpf) else mpf(float(x)) for x in (start[i] for i in peer.order)]]
-    for u in controls:
-        path.append(oracle.once(path[-1], u, peer.step(env), DIGITS))
-    return [[y[i] for i in own] for y in path]
+def exact_peer_step(env: Any, peer: GymnasiumPeer) -> ExactStep:
+    """Return the exact step of a peer's equations of motion."""
+    oracle, own, dt = oracle_of(peer.scene(env)), np.argsort(peer.order), peer.step(env)
+
+    def step(state: Sequence[Any], number: int, control: float) -> list[mpf]:
+        end = oracle.once([state[i] for i in peer.order], control, dt, DIGITS)
+        return [end[i] for i in own]
+
+    return step

@@ -92,14 +92,18 @@ def phis(z: Any, xp: Any) -> list:
     return [xp.where(z <= 2.0, near, there) for near, there in zip(phi, far, strict=True)]
 
 
+_ROOT = math.sqrt(6.0)
+#: Radau IIA's matrix (Hairer, Wanner, "Solving Ordinary Differential Equations II", table IV.5.6).
+RADAU = [
+    [(88.0 - 7.0 * _ROOT) / 360.0, (296.0 - 169.0 * _ROOT) / 1800.0, (-2.0 + 3.0 * _ROOT) / 225.0],
+    [(296.0 + 169.0 * _ROOT) / 1800.0, (88.0 + 7.0 * _ROOT) / 360.0, (-2.0 - 3.0 * _ROOT) / 225.0],
+    [(16.0 - _ROOT) / 36.0, (16.0 + _ROOT) / 36.0, 1.0 / 9.0],
+]
+
+
 def radau(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
     """Radau IIA of order 5, stiffly accurate, by Newton's method on the accelerations of its three stages."""
-    root = math.sqrt(6.0)
-    a = [
-        [(88.0 - 7.0 * root) / 360.0, (296.0 - 169.0 * root) / 1800.0, (-2.0 + 3.0 * root) / 225.0],
-        [(296.0 + 169.0 * root) / 1800.0, (88.0 + 7.0 * root) / 360.0, (-2.0 - 3.0 * root) / 225.0],
-        [(16.0 - root) / 36.0, (16.0 + root) / 36.0, 1.0 / 9.0],
-    ]
+    a = RADAU
     twice = [[sum(a[i][k] * a[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
     c = [sum(row) for row in a]
     hh = h * h

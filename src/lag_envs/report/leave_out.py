@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -159,19 +159,19 @@ def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
 
 def savings(count: int, rounds: int) -> Iterator[Row]:
     """Yield operations and times of a step without something and with it, in a batch, timed in turn."""
-    samples = {}
+    samples = []
     for pair in PAIRS[:count]:
-        for name, stepped in zip(("without", "having"), pair.stepped(), strict=True):
+        for stepped in pair.stepped():
             scene = stepped.scene
             state = tuple(0.1 * (i + 1) for i in range(len(scene.state_names)))
             cases = [Case(scene, state, 0.1)] * BATCH
-            samples[f"{pair.left_out}, {name}"] = at_once(FlowSteps(scene, stepped.flow), cases, 8, pair.dt)
+            samples.append(at_once(FlowSteps(scene, stepped.flow), cases, 8, pair.dt))
     times = interleaved(samples, rounds)
-    for pair in PAIRS[:count]:
+    for i, pair in enumerate(PAIRS[:count]):
+        operations = [stepped.stepper().operations for stepped in pair.stepped()]
         yield {
-            "kind": "savings", "left_out": pair.left_out,
-            "operations": [stepped.stepper().operations for stepped in pair.stepped()],
-            "ns": [times[f"{pair.left_out}, {name}"] for name in ("without", "having")],
+            "kind": "savings", "left_out": pair.left_out, "operations": operations,
+            "ns": times[2 * i : 2 * i + 2],
         }  # fmt: skip
 
 
@@ -193,10 +193,11 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     """Return the section's content."""
     found = [row for row in rows if row["kind"] == "terms"]
     saved = [row for row in rows if row["kind"] == "savings"]
+    carried = _terms(found)
     return Content(
         title="What each environment leaves out",
         text=TEXT,
-        tables=[_terms(found), _savings(saved)],
+        tables=[carried, _savings(saved)],
         pictures=[
             ReportFigure(
                 "leave-out",
@@ -208,89 +209,64 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
         if saved
         else [],
         claims=_claims(found, saved),
-        summary=_summary(found),
+        summary=_summary(carried),
     )
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) or "none"
+def _listed(name: str) -> Callable[[Row], str]:
+    """Return a function that shows a row's entry of this name, a list."""
+    return lambda row: ", ".join(row[name]) or "none"
 
 
 def _terms(rows: list[Row]) -> Table:
-    head = (
-        "id",
-        "state",
-        "terms",
-        "left out",
-        "a step is",
-        "constants",
-        "zero",
-        "operations",
-        "unused",
-        "idle",
-    )
-    lists = ("state", "terms", "left_out"), ("constants", "zero"), ("unused", "idle")
-    return Table(
+    return Table.of(
         "leave-out-terms",
         "The features that each id has and leaves out; operations are those of one step of the dynamics.",
-        head,
-        [
-            (
-                row["id"],
-                *(_listed(row[name]) for name in lists[0]),
-                row["stages"],
-                *(_listed(row[name]) for name in lists[1]),
-                row["operations"],
-                *(_listed(row[name]) for name in lists[2]),
-            )
-            for row in rows
-        ],
+        {
+            "id": "id",
+            "state": _listed("state"),
+            "terms": _listed("terms"),
+            "left out": _listed("left_out"),
+            "a step is": "stages",
+            "constants": _listed("constants"),
+            "zero": _listed("zero"),
+            "operations": "operations",
+            "unused": _listed("unused"),
+            "idle": _listed("idle"),
+        },
+        rows,
     )
 
 
 def _savings(rows: list[Row]) -> Table:
-    head = ("left out", "operations without", "with", "ns without", "ns with", "saved [ns]", "saved [%]")
-    return Table(
+    return Table.of(
         "leave-out-savings",
         "The time that leaving a feature out saves.",
-        head,
-        [
-            (
-                row["left_out"],
-                *row["operations"],
-                *row["ns"],
-                row["ns"][1] - row["ns"][0],
-                100.0 * (1.0 - row["ns"][0] / row["ns"][1]),
-            )
-            for row in rows
-        ],
+        {
+            "left out": "left_out",
+            "operations without": lambda row: row["operations"][0],
+            "with": lambda row: row["operations"][1],
+            "ns without": lambda row: row["ns"][0],
+            "ns with": lambda row: row["ns"][1],
+            "saved [ns]": lambda row: row["ns"][1] - row["ns"][0],
+            "saved [%]": lambda row: 100.0 * (1.0 - row["ns"][0] / row["ns"][1]),
+        },
+        rows,
     )
 
 
-def _summary(rows: list[Row]) -> Table | None:
-    if not rows:
-        return None
-    return Table(
-        "leave_out",
-        "The parts of each environment's step:",
-        ("id", "state", "terms", "left out", "operations", "unused"),
-        [
-            (
-                row["id"],
-                _listed(row["state"]),
-                _listed(row["terms"]),
-                _listed(row["left_out"]),
-                row["operations"],
-                _listed(row["unused"]),
-            )
-            for row in rows
-        ],
-    )
+def _summary(carried: Table) -> Table | None:
+    """Return some columns of the terms."""
+    columns = ("id", "state", "terms", "left out", "operations", "unused")
+    caption = "The parts of each environment's step:"
+    return carried.part("leave_out", caption, columns) if carried.rows else None
 
 
 def _claims(rows: list[Row], saved: list[Row]) -> list[Claim]:
     unused = [
-        f"{row['id']}: {_listed(row['unused'] + row['idle'])}" for row in rows if row["unused"] + row["idle"]
+        f"{row['id']}: {', '.join(row['unused'] + row['idle'])}"
+        for row in rows
+        if row["unused"] + row["idle"]
     ]
     more = [row["left_out"] for row in saved if row["operations"][0] >= row["operations"][1]]
     return [

@@ -167,14 +167,20 @@ SYSTEMS = {
 class Engine(LibraryRival):
     """A rival with its own model, made of a system's links; it takes one state after the other."""
 
-    batched = False
+    fixed, batched = True, False
 
 
 def _given(problems: Problems) -> tuple[System, Array, Array, Array]:
     """Return the system, joints' places and velocities, and controls."""
     assert isinstance(problems, SceneProblems) and problems.system is not None
-    system, n = problems.system, problems.equation.size // 2
-    return system, system.turned(problems.y[:n]), system.turned(problems.y[n:]), problems.controls[:, 0]
+    system = problems.system
+    q, v = map(system.turned, np.split(problems.y, 2))
+    return system, q, v, problems.controls[:, 0]
+
+
+def _ends(problems: Problems, system: System, joints: Array, span: float) -> Array:
+    """Return the states for joints' places and velocities, one row each, after a time."""
+    return problems.states(np.concatenate([system.back(half) for half in np.split(joints.T, 2)]), span)
 
 
 # --- MuJoCo ---
@@ -212,7 +218,6 @@ class MuJoCoLinks(Engine):
         "implicitfast": (1, 8, 64, 512),
         "RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256),
     }
-    stepped = ("Euler", "implicitfast", "RK4")
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make a model for each field; one is enough if the control is a force."""
@@ -234,16 +239,11 @@ class MuJoCoLinks(Engine):
         held = np.repeat(system.forces(controls)[:, None], n, axis=1)
         path = np.empty((count, n, start.shape[1]))
         given = models if len(models) == count else models * count
-
-        def run() -> None:
-            rollout(given, data, start, held, state=path, skip_checks=False)
-
-        def ends() -> Array:
-            half = q.shape[0]
-            q_end, v_end = path[:, -1, 1 : 1 + half].T, path[:, -1, 1 + half :].T
-            return problems.states(np.concatenate([system.back(q_end), system.back(v_end)]), dt * steps)
-
-        return Sample(run, count * steps, ends=ends)
+        return Sample(
+            lambda: rollout(given, data, start, held, state=path, skip_checks=False),
+            count * steps,
+            ends=lambda: _ends(problems, system, path[:, -1, 1:], dt * steps),
+        )
 
 
 def mujoco_motion(system: System, q: Array, v: Array, control: float) -> tuple[Array, Array]:
@@ -271,27 +271,22 @@ class PinocchioLinks(Engine):
 
     family = "pinocchio"
     settings: ClassVar = {"ABA, RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256)}
-    stepped = ("ABA, RK4",)
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make the model."""
         system, q, v, controls = _given(problems)
-        library, model = pinocchio(), pinocchio_model(system)
-        n, count, half = self.substeps(steps), len(controls), q.shape[0]
+        library, model = pinocchio(), pinocchio_model(tuple(system.links))
+        n, count = self.substeps(steps), len(controls)
         start = np.ascontiguousarray(np.concatenate([q, v]).T)
         found = np.empty_like(start)
         forces, fields = system.forces(controls), np.ascontiguousarray(system.fields(controls))
         h = ctypes.c_double(dt * steps / n)
         arrays = [_pointer(x) for x in (start, forces, fields, found)]
-
-        def run() -> None:
-            library.run(model, count, n, h, *arrays)
-
-        def ends() -> Array:
-            joints = found[:, :half].T, found[:, half:].T
-            return problems.states(np.concatenate([system.back(x) for x in joints]), dt * steps)
-
-        return Sample(run, count * steps, ends=ends)
+        return Sample(
+            lambda: library.run(model, count, n, h, *arrays),
+            count * steps,
+            ends=lambda: _ends(problems, system, found, dt * steps),
+        )
 
 
 def _pointer(array: Array) -> Any:
@@ -347,7 +342,8 @@ def _headers() -> Path:
 
 
 @cache
-def _model(links: tuple[Link, ...]) -> Any:
+def pinocchio_model(links: tuple[Link, ...]) -> Any:
+    """Return Pinocchio's model of links."""
     numbers = [
         [float(link.kind == "hinge"), *link.axis, *link.place, link.mass, *link.centre,
          *(0.0 if x == THIN else x for x in link.inertia)]
@@ -357,17 +353,12 @@ def _model(links: tuple[Link, ...]) -> Any:
     return pinocchio().make(len(links), _pointer(table))
 
 
-def pinocchio_model(system: System) -> Any:
-    """Return Pinocchio's model of a system."""
-    return _model(tuple(system.links))
-
-
 def pinocchio_motion(system: System, q: Array, v: Array, control: float) -> tuple[Array, Array]:
     """Return Pinocchio's mass matrix and accelerations for given joint positions and velocities."""
     n, controls = len(q), np.array([control])
     acceleration, mass = np.empty(n), np.empty((n, n))
     given = [np.ascontiguousarray(x) for x in (q, v, system.forces(controls)[0], system.fields(controls)[0])]
-    pinocchio().motion(pinocchio_model(system), *map(_pointer, [*given, acceleration, mass]))
+    pinocchio().motion(pinocchio_model(tuple(system.links)), *map(_pointer, [*given, acceleration, mass]))
     return mass, acceleration
 
 
@@ -387,9 +378,8 @@ def differences(system: System, family: str) -> tuple[float, float]:
 
     states, controls = system.draw(50, seed=1)
     problems = SceneProblems(system.scene, states, controls, system)
-    n = problems.equation.size // 2
-    q, v = system.turned(problems.y[:n]), system.turned(problems.y[n:])
-    turn = system.turned(np.eye(n))
+    _, q, v, _ = _given(problems)
+    turn = system.turned(np.eye(len(q)))
     oracle, found = oracle_of(system.scene), []
     for j in range(len(states)):
         mass, acceleration = oracle.at(states[j].tolist(), controls[j].tolist())

@@ -17,7 +17,7 @@ from lag_envs.mechanics.recording import control, parameter, parameter_values
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.oracle import oracle_of, solve_positive
 from lag_envs.report.rivals import Rival
-from lag_envs.report.timing import BLOCK, Sample
+from lag_envs.report.timing import BLOCK, Sample, blocks, unblocked
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.stepping.compiling import compile_function
@@ -120,8 +120,8 @@ class SceneProblems(Problems):
         layout = layout_of(scene)
         zero = np.zeros(len(starts))
         held = dict(zip(layout.controls, controls.T, strict=True))
-        self._q, self._v = oracle_of(scene).start(list(starts.T), list(controls.T), lambda x: zero + x)
-        self._shift(-1.0)
+        self._q, w = oracle_of(scene).start(list(starts.T), list(controls.T), lambda x: zero + x)
+        self._v = self._shifted(self._q, w, -1.0)
         free, moving = layout.free, [m.name for m in layout.at("acceleration", "rate")]
         self.y = np.array([*(self._q[name] for name in free), *(self._v[name] for name in free)])
         known = held | {name: self._q[name] for name in moving}
@@ -132,54 +132,40 @@ class SceneProblems(Problems):
     def __len__(self) -> int:
         return len(self.starts)
 
-    def _shift(self, sign: float) -> None:
-        """Convert w to velocities, if a rate is held, or back."""
-        scene = self.scene
-        if layout_of(scene).at("rate"):
-            shift = oracle_of(scene).shift(self._q, self._v, list(self.controls.T))
-            self._v |= {
-                name: self._v[name] + sign * x for name, x in zip(layout_of(scene).free, shift, strict=True)
-            }
+    def _shifted(self, q: dict, v: dict, sign: float) -> dict:
+        """Return velocities for w, if a rate is held, or w for velocities."""
+        if not layout_of(self.scene).at("rate"):
+            return v
+        shift = oracle_of(self.scene).shift(q, v, list(self.controls.T))
+        return v | {n: v[n] + sign * x for n, x in zip(layout_of(self.scene).free, shift, strict=True)}
 
     def states(self, y: Array, span: float) -> Array:
         """Return the scene's states, one per line, from unknowns after a time with the controls held."""
         layout = layout_of(self.scene)
         n = len(layout.free)
-        q, v = dict(self._q), dict(self._v)
-        try:
-            self._q |= dict(zip(layout.free, y[:n], strict=True))
-            self._v |= dict(zip(layout.free, y[n : 2 * n], strict=True))
-            held = dict(zip(layout.controls, self.controls.T, strict=True))
-            for p in layout.at("acceleration", "rate"):
-                push = held[p.control or ""] if p.level == "acceleration" else 0.0
-                self._q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * push))
-                self._v[p.name] = v[p.name] + span * push
-            self._shift(1.0)
-            return np.stack(
-                [(self._q if e.kind == "place" else self._v)[e.coordinate] for e in layout.state], axis=1
-            )
-        finally:
-            self._q, self._v = q, v
+        q = self._q | dict(zip(layout.free, y[:n], strict=True))
+        v = self._v | dict(zip(layout.free, y[n : 2 * n], strict=True))
+        held = dict(zip(layout.controls, self.controls.T, strict=True))
+        for p in layout.at("acceleration", "rate"):
+            push = held[p.control or ""] if p.level == "acceleration" else 0.0
+            q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * push))
+            v[p.name] = v[p.name] + span * push
+        v = self._shifted(q, v, 1.0)
+        return np.stack([(q if e.kind == "place" else v)[e.coordinate] for e in layout.state], axis=1)
 
 
 class CertifiedSeries(Rival):
-    """The general engine at a tolerance and an order, each step certified, in its shipped loops.
+    """The general engine at an order and a tolerance, each step certified, in its shipped loops.
 
-    The setting is the tolerance; the method names the order. Alone it runs the loop of `Scene.simulate`, in a
-    batch the block function of the vector environments, both over one control step from each state.
+    The setting is the tolerance. Alone it runs the loop of `Scene.simulate`, in a batch the block function of
+    the vector environments, both over one control step from each state.
     """
 
     family = "lag_envs"
 
-    @staticmethod
-    def method_of(order: int) -> str:
-        """Return the name of the method with an order."""
-        return f"lag_envs, order {order}"
-
-    @property
-    def order(self) -> int:
-        """Order of the series."""
-        return int(self.method.rpartition(" ")[2])
+    def __init__(self, order: int, tolerance: float) -> None:
+        super().__init__(f"lag_envs, order {order}", tolerance)
+        self.order = order
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile."""
@@ -198,15 +184,8 @@ class CertifiedSeries(Rival):
 
             return Sample(run, count, ends=ends.copy)
         batch = _batch(code, self.setting)
-        blocks = -(-count // BLOCK)
-        rows = width + controls.shape[1] + len(code.rows) + 1
-        memory = np.zeros((blocks, rows, BLOCK))
-        begin = np.zeros((blocks, width + controls.shape[1], BLOCK))
-        flat = np.concatenate([starts, controls], axis=1).T
-        for i in range(blocks):
-            part = flat[:, i * BLOCK : (i + 1) * BLOCK]
-            begin[i, :, : part.shape[1]] = part
-            begin[i, :, part.shape[1] :] = part[:, :1]
+        begin = blocks(np.concatenate([starts, controls], axis=1).T, BLOCK)
+        memory = np.zeros((len(begin), begin.shape[1] + len(code.rows) + 1, BLOCK))
 
         def prepare() -> None:
             memory[:, : begin.shape[1]] = begin
@@ -215,12 +194,7 @@ class CertifiedSeries(Rival):
             if batch(memory.reshape(-1), count, dt, order, *numbers):
                 raise ArithmeticError("a step was refused")
 
-        return Sample(
-            together_run,
-            count,
-            prepare,
-            lambda: memory[:, :width].transpose(0, 2, 1).reshape(-1, width)[:count].copy(),
-        )
+        return Sample(together_run, count, prepare, lambda: unblocked(memory[:, :width], count).T.copy())
 
 
 @cache

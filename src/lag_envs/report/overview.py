@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from lag_envs.report.diagrams import DARK, STYLES
+from lag_envs.report.diagrams import DARK, STYLES, labelled_lines
 from lag_envs.report.points import LAG_ENVS
 
 if TYPE_CHECKING:
@@ -38,11 +38,7 @@ def draw_overview(accuracy: dict[str, Any]) -> Figure:
     _panel(left, "A bar on a moving support: a dedicated step", *own_step(accuracy))
     _panel(right, "A driven double pendulum: the general series", *general(accuracy))
     left.set_ylabel("largest error of one control step, relative")
-    shown = {
-        label: line
-        for ax in (left, right)
-        for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
+    shown = labelled_lines((left, right))
     first = f"{LAG_ENVS}, with a proved bound"
     names = [first, *sorted(set(shown) - {first})]
     figure.legend([shown[name] for name in names], names, loc="outside lower center", ncols=5, fontsize=8)

@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,13 +24,11 @@ from lag_envs.envs.single import LagrangianEnv
 from lag_envs.errors import UserError
 from lag_envs.report import general, general_results
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
-from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
+from lag_envs.report.motions import Array, SceneProblems
 from lag_envs.report.oracle import Unresolved
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.points import MODES
-from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.reference import exact_ends
-from lag_envs.report.rivals import CompiledMethod, Rival
 from lag_envs.report.runner import JobResult, ReportJob, Row
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
@@ -137,14 +136,11 @@ def _of_task(label: str, task: Any) -> Subject:
 
 def _of_scene(label: str, scene: Scene) -> Subject:
     """Return a scene without a task as a subject: ±1, or ±π for an angle, and twice that for speeds."""
-    boxes = [(0.0, math.pi if "rad" in unit else 1.0) for unit in scene.state_units]
-    widths = [
-        2.0 * half if unit.endswith("/s") else half
-        for (_, half), unit in zip(boxes, scene.state_units, strict=True)
+    boxes = [
+        (0.0, (math.pi if "rad" in unit else 1.0) * (2.0 if unit.endswith("/s") else 1.0))
+        for unit in scene.state_units
     ]
-    return Subject(
-        label, scene, general_results.DT, [(0.0, w) for w in widths], [(-1.0, 1.0)] * len(scene.control_names)
-    )
+    return Subject(label, scene, general_results.DT, boxes, [(-1.0, 1.0)] * len(scene.control_names))
 
 
 def subject(file: str, name: str) -> Subject:
@@ -155,10 +151,8 @@ def subject(file: str, name: str) -> Subject:
 # --- jobs ---
 
 
-def jobs(quick: bool, file: str = "") -> list[ReportJob]:
+def jobs(quick: bool, file: str) -> list[ReportJob]:
     """Return the jobs: errors and certificate, stability, then everything that is timed."""
-    if not file:
-        return []
     path = Path(own_files.split_path(file)[0])
     # Rows from another version of the file are not reused.
     about = {
@@ -166,23 +160,16 @@ def jobs(quick: bool, file: str = "") -> list[ReportJob]:
         "digest": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
         "quick": quick,
     }
-    names = [s.name for s in subjects(file)]
+    found = subjects(file)
+    kinds = {"steps": "shipped_steps", "stability": "stability", "points": "step_points"}
     return [
         ReportJob(
-            SECTION,
-            f"{what}: {name}",
-            f"{SECTION}:{function}",
-            about | {"name": name},
-            900.0,
+            SECTION, f"{what}: {s.name}", f"{SECTION}:{function}", about | {"name": s.name}, 900.0,
             alone=what == "points",
         )
-        for what, function in (
-            ("steps", "shipped_steps"),
-            ("stability", "stability"),
-            ("points", "step_points"),
-        )
-        for name in names
-    ]
+        for what, function in kinds.items()
+        for s in found
+    ]  # fmt: skip
 
 
 def shipped_steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
@@ -233,24 +220,11 @@ def step_points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]
     copies = max(1, 1024 // len(starts))
     problems = SceneProblems(s.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)))
     some: slice = slice(-1, None, -3) if quick else slice(None)
-    compiled_here: list[Rival] = [
-        CertifiedSeries(CertifiedSeries.method_of(order), tolerance)
-        for tolerance in TOLERANCES[some]
-        for order in ORDERS[some]
-    ]
-    compiled_here += [
-        CompiledMethod(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]
-    ]
-    compiled_here += [
-        CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]
-    ]
-    others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
-    clock = CertifiedSeries(CertifiedSeries.method_of(16), 1e-12)
+    compiled_here = general.compiled_rivals(list(product(TOLERANCES[some], ORDERS[some])), some)
+    others = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
     for mode in MODES:
         for rivals in (compiled_here, others):
-            yield from general.timed_rivals(
-                problems, truth, rivals, clock, mode, 3 if quick else 7, {"system": name}, s.dt
-            )
+            yield from general.timed_rivals(name, problems, truth, rivals, mode, 3 if quick else 7, s.dt)
 
 
 def extreme_variants(s: Subject) -> Iterator[tuple[str, Scene, float]]:
@@ -325,7 +299,8 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
         for name in names
         if (some := [r for r in rows if r["kind"] == "point" and r["system"] == name and "ns" in r])
     ]
-    missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
+    missing = general_results.missing(rows)
+    times = [general_results.best_times("own", found, mode) for mode in MODES]
     return Content(
         "Your own scenes",
         [
@@ -337,85 +312,53 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "The certificate bounds the truncation error of the step's series; rounding comes on top. "
             f"Stability is tested with each parameter multiplied by {factors}, where its range allows it: a "
             "step that cannot be certified is refused, and the change of energy has to equal the work done.",
-            *([f"Not included: {', '.join(missing)}."] if missing else []),
+            *([f"Not included: {missing}."] if missing else []),
         ],
-        [
-            t
-            for t in (
-                _steps(rows),
-                *(_times(found, mode) for mode in MODES),
-                _stability(rows),
-            )
-            if t.rows
-        ],
+        [t for t in (_steps(rows), *times, _stability(rows)) if t.rows],
         pictures,
         _claims(rows) if rows else [],
-        details=[_all(rows)],
+        details=[general_results.all_points("own-points", rows)],
     )
-
-
-def _of(rows: Sequence[Row], kind: str) -> dict[str, list[Row]]:
-    found: dict[str, list[Row]] = {}
-    for r in rows:
-        if r["kind"] == kind:
-            found.setdefault(r["subject"], []).append(r)
-    return found
 
 
 def _steps(rows: Sequence[Row]) -> Table:
-    exact, found = _of(rows, "step"), []
-    for name, (c,) in _of(rows, "certificate").items():
-        share = f"{100.0 * c['share']:.1f} % of {c['states']:,}"
-        errors = [r["error"] for r in exact.get(name, [])]
-        found.append((
-            name, c["dt"], c["order"], share, c["attempts"], c["refused"],
-            c["bound"], max(errors, default=None), len(errors),
-        ))  # fmt: skip
-    return Table(
+    errors: dict[str, list[float]] = {}
+    for r in rows:
+        if r["kind"] == "step":
+            errors.setdefault(r["subject"], []).append(r["error"])
+    return Table.of(
         "own-steps",
         "Steps as shipped: the share certified in one attempt, attempts per step, the largest bound "
         "in units of the state, and the worst error where the exact end was computed",
-        (
-            "scene",
-            "step [s]",
-            "order",
-            "certified as a whole",
-            "attempts",
-            "refused",
-            "largest bound",
-            "worst error",
-            "of",
-        ),
-        found,
+        {
+            "scene": "subject",
+            "step [s]": "dt",
+            "order": "order",
+            "certified as a whole": lambda r: f"{100.0 * r['share']:.1f} % of {r['states']:,}",
+            "attempts": "attempts",
+            "refused": "refused",
+            "largest bound": "bound",
+            "worst error": lambda r: max(errors.get(r["subject"], ()), default=None),
+            "of": lambda r: len(errors.get(r["subject"], ())),
+        },
+        [r for r in rows if r["kind"] == "certificate"],
     )
-
-
-def _times(found: Mapping[tuple, Mapping[str, general_results.BestSetting]], mode: str) -> Table:
-    return dataclasses.replace(general_results.best_times(found, mode), name=f"own-times-{mode}")
 
 
 def _stability(rows: Sequence[Row]) -> Table:
-    return Table(
+    return Table.of(
         "own-stability",
         "Extreme parameters and states: refused steps, and the largest imbalance of energy, relative to "
         "energy and work",
-        ("scene", "case", "steps", "refused", "balance"),
-        [
-            (
-                r["subject"],
-                r["case"],
-                r["states"],
-                r["refused"],
-                "no number" if r["balance"] is None else r["balance"],
-            )
-            for r in rows
-            if r["kind"] == "stability"
-        ],
+        {
+            "scene": "subject",
+            "case": "case",
+            "steps": "states",
+            "refused": "refused",
+            "balance": lambda r: "no number" if r["balance"] is None else r["balance"],
+        },
+        [r for r in rows if r["kind"] == "stability"],
     )
-
-
-def _all(rows: Sequence[Row]) -> Table:
-    return dataclasses.replace(general_results.all_points(rows), name="own-points")
 
 
 def _claims(rows: Sequence[Row]) -> list[Claim]:

@@ -16,8 +16,8 @@ import numpy as np
 
 from lag_envs.report.arithmetic import Arithmetic
 from lag_envs.report.equations import Array, Equation, Problems
-from lag_envs.report.rivals import Rival, blocks, unblocked
-from lag_envs.report.timing import Sample
+from lag_envs.report.rivals import Rival
+from lag_envs.report.timing import Sample, blocks, unblocked
 from lag_envs.scenes import PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
@@ -30,10 +30,8 @@ SUBSTEPS = (1, 4, 16, 64)
 class LibraryRival(Rival):
     """A rival from another library."""
 
-    #: The methods to measure, each with tolerances or substeps.
+    #: The methods to measure, each with tolerances, or with substeps per control step if it is fixed.
     settings: ClassVar[dict[str, Sequence[float]]]
-    #: Methods whose setting is a number of substeps per control step.
-    stepped: ClassVar[Sequence[str]] = ()
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
@@ -42,7 +40,7 @@ class LibraryRival(Rival):
 
     def __init__(self, method: str, setting: float) -> None:
         super().__init__(method, setting)
-        self.fixed = method in self.stepped
+        self.fixed = self.fixed or method.endswith(", fixed")
 
 
 # --- SciPy ---
@@ -315,7 +313,6 @@ class Diffrax(LibraryRival):
         "Tsit5": TOLERANCES[::2], "Dopri8": TOLERANCES[::2], "Tsit5, fixed": (1, 4, 16),
         "Dopri8, fixed": (1, 2, 4),
     }  # fmt: skip
-    stepped = ("Tsit5, fixed", "Dopri8, fixed")
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile."""
@@ -381,7 +378,6 @@ class Torchdiffeq(LibraryRival):
     settings: ClassVar = {
         "dopri5": TOLERANCES[::2], "dopri8": TOLERANCES[::2], "rk4, fixed": SUBSTEPS[:3],
     }  # fmt: skip
-    stepped = ("rk4, fixed",)
     shared = True  # a batch is one tensor
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
@@ -417,22 +413,20 @@ class Torchdiffeq(LibraryRival):
 
 # --- MuJoCo ---
 
-#: Models by scene, in the frame of the prescribed motion: its acceleration tilts gravity. Contacts and
-#: constraints, of which there are none, are switched off.
-MODELS: dict[type[Scene], str] = {
-    PivotedBar: """
-    <mujoco>
-      <option gravity="{minus_control!r} 0 {minus_gravity!r}" integrator="{integrator}" timestep="{step!r}">
-        <flag contact="disable" constraint="disable"/>
-      </option>
-      <worldbody><body>
-        <joint type="hinge" axis="0 -1 0" damping="{scene.damping!r}"/>
-        <inertial pos="0 0 -{scene.com_distance!r}" mass="{scene.mass!r}"
-                  diaginertia="{scene.inertia!r} {scene.inertia!r} {scene.inertia!r}"/>
-      </body></worldbody>
-    </mujoco>
-    """
-}
+#: The bar in the frame of its support, whose acceleration tilts gravity. Contacts and constraints, of which
+#: there are none, are switched off.
+BAR = """
+<mujoco>
+  <option gravity="{minus_control!r} 0 {minus_gravity!r}" integrator="{integrator}" timestep="{step!r}">
+    <flag contact="disable" constraint="disable"/>
+  </option>
+  <worldbody><body>
+    <joint type="hinge" axis="0 -1 0" damping="{scene.damping!r}"/>
+    <inertial pos="0 0 -{scene.com_distance!r}" mass="{scene.mass!r}"
+              diaginertia="{scene.inertia!r} {scene.inertia!r} {scene.inertia!r}"/>
+  </body></worldbody>
+</mujoco>
+"""
 
 
 class MuJoCo(LibraryRival):
@@ -440,28 +434,25 @@ class MuJoCo(LibraryRival):
 
     family = "mujoco"
     settings: ClassVar = {"Euler": SUBSTEPS, "implicitfast": SUBSTEPS, "RK4": SUBSTEPS}
-    stepped = ("Euler", "implicitfast", "RK4")
+    fixed, batched = True, False  # a rollout takes one state after the other
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
         """Return whether there is a model of the scene."""
-        return any(kind in MODELS for kind in type(scene).__mro__)
-
-    batched = False  # a rollout takes one state after the other
+        return isinstance(scene, PivotedBar)
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make a model of every problem."""
-        kind = type(problems.cases[0].scene)
-        model = next((MODELS[base] for base in kind.__mro__ if base in MODELS), None)
-        if model is None:
-            raise ValueError(f"there is no MuJoCo model of {kind.__name__}")
+        scene = problems.cases[0].scene
+        if not self.solves(scene):
+            raise ValueError(f"there is no MuJoCo model of {type(scene).__name__}")
         import mujoco
         from mujoco.rollout import rollout
 
         n = self.substeps(steps)
         models = [
             mujoco.MjModel.from_xml_string(
-                model.format(
+                BAR.format(
                     scene=scene, minus_control=-control, minus_gravity=-scene.gravity,  # type: ignore[attr-defined]
                     integrator=self.method, step=dt * steps / n,
                 )

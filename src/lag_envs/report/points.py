@@ -22,6 +22,7 @@ LIBRARIES = {
     "diffrax": "diffrax",
     "torchdiffeq": "torchdiffeq",
     "mujoco": "MuJoCo",
+    "pinocchio": "Pinocchio",
 }
 
 

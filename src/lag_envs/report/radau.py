@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 
 from lag_envs.report.equations import Equation, Problems
+from lag_envs.report.integrators import RADAU
 from lag_envs.report.peers import rate_lines
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import Sample
 from lag_envs.stepping.compiling import compile_function
 
-_ROOT = math.sqrt(6.0)
-#: The method's matrix (Hairer, Wanner, "Solving Ordinary Differential Equations II", table IV.5.6).
-A = np.array([
-    [(88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225],
-    [(296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225],
-    [(16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9],
-])  # fmt: skip
+A = np.array(RADAU)
 #: Relative size of the last correction, iterations at most, and the step of the Jacobian's differences.
 LAST, MOST, APART = 1e-14, 20, 1e-7
 
@@ -73,8 +67,10 @@ class CompiledRadau(Rival):
     """Radau IIA with steps of one length."""
 
     family = "compiled"
-    METHOD = "Radau IIA"
     fixed, batched = True, False
+
+    def __init__(self, setting: float) -> None:
+        super().__init__("Radau IIA", setting)
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the loop."""

@@ -19,9 +19,9 @@ import numpy as np
 
 from lag_envs.report.arithmetic import Arithmetic
 from lag_envs.report.cases import Case
-from lag_envs.report.equations import Array, Equation, Problems
+from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS
-from lag_envs.report.timing import BLOCK, FlowSteps, Sample, at_once, one_by_one
+from lag_envs.report.timing import BLOCK, FlowSteps, Sample, at_once, blocks, one_by_one, unblocked
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
@@ -95,14 +95,14 @@ class ShippedStepping(Rival):
 
     changing = True  # a trajectory has a control for each step
 
-    def __init__(self, method: str, setting: float) -> None:
-        super().__init__(method, setting)
-        self.fixed = method == self.METHOD
+    def __init__(self, setting: float = 1, one_call: bool = False) -> None:
+        super().__init__(self.ONE_CALL if one_call else self.METHOD, setting)
+        self.fixed = not one_call
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the scene's own step; scenes with other parameters are separate batches."""
         cases = problems.cases
-        count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
+        count = self.substeps(steps) if self.fixed else 1
         length = dt * steps / count
         kernels = FlowSteps(cases[0].scene, dt=length)
         alike: dict[Scene, list[Case]] = {}
@@ -230,28 +230,3 @@ def _batch(equation: Equation, method: str, carried: bool) -> Callable:
         *(f"            {at[name]} = {name}" for name in y),
     ]
     return compile_function("batch", "\n    ".join(lines) + "\n")
-
-
-def blocks(columns: Array, width: int) -> Array:
-    """Return columns in blocks, shape (blocks, rows, width); the last is padded with the first column.
-
-    Examples
-    --------
-    >>> blocks(np.array([[1.0, 2.0, 3.0]]), 2).tolist()
-    [[[1.0, 2.0]], [[3.0, 1.0]]]
-    """
-    rows, count = columns.shape
-    missing = -count % width
-    filled = np.concatenate([columns, np.repeat(columns[:, :1], missing, axis=1)], axis=1)
-    return np.ascontiguousarray(filled.reshape(rows, (count + missing) // width, width).transpose(1, 0, 2))
-
-
-def unblocked(found: Array, count: int) -> Array:
-    """Return the columns from the result of `blocks`.
-
-    Examples
-    --------
-    >>> unblocked(blocks(np.array([[1.0, 2.0, 3.0]]), 2), 3).tolist()
-    [[1.0, 2.0, 3.0]]
-    """
-    return found.transpose(1, 0, 2).reshape(found.shape[1], -1)[:, :count]

@@ -16,14 +16,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import lag_envs
 from lag_envs import store
-from lag_envs.host import machine
+from lag_envs.host import installed_versions, machine
 from lag_envs.progress import progress
 from lag_envs.workers import as_they_finish, died, processes
 
@@ -80,13 +79,8 @@ def fingerprint() -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and packages."""
-    found = {"lag_envs": lag_envs.__version__}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    absent = dict.fromkeys(LIBRARIES, "not installed")
+    return {"lag_envs": lag_envs.__version__} | absent | installed_versions(LIBRARIES)
 
 
 def run_jobs(
@@ -119,19 +113,15 @@ def run_jobs(
         tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are reused from before")
     complete = True
     with progress(len(todo)) as advance:
-
-        def keep(result: JobResult) -> None:
-            known[result.key] = result
-            store.append(file, vars(result))
-            advance(f"{result.section}: {result.name}")
-            if result.problem:
-                tell(f"{result.section}: {result.name}: {result.problem}")
-
-        pools = [([job for job in todo if not job.alone], processes), ([job for job in todo if job.alone], 1)]
         try:
-            for part, count in pools:
-                for result in _in_processes(part, folder, count):
-                    keep(result)
+            for alone in (False, True):
+                part = [job for job in todo if job.alone is alone]
+                for result in _in_processes(part, folder, 1 if alone else processes):
+                    known[result.key] = result
+                    store.append(file, vars(result))
+                    advance(f"{result.section}: {result.name}")
+                    if result.problem:
+                        tell(f"{result.section}: {result.name}: {result.problem}")
         except KeyboardInterrupt:
             complete = False
     return [known[job.key] for job in jobs if job.key in known], complete

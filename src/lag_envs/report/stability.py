@@ -32,7 +32,8 @@ from lag_envs.scenes.derivation import motion_constants_of
 __all__ = ["content", "extreme_errors", "jobs", "largest_errors", "map_errors", "methods", "step_cases"]
 
 SECTION = "stability"
-PRECISIONS: dict[str, type[np.floating]] = {"float64": np.float64, "float32": np.float32}
+#: Precisions of the comparison integrators, and what their names end with.
+PRECISIONS: dict[str, type[np.floating]] = {"": np.float64, ", float32": np.float32}
 
 
 def jobs(quick: bool) -> list[ReportJob]:
@@ -139,8 +140,7 @@ def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
     ends: dict[str, list[Any]] = {LAG_ENVS: [_shipped(case, dt) for case in found]}
     flow = Stepped(found[0].scene, dt=dt).flow
     with np.errstate(all="ignore"):
-        for precision, dtype in PRECISIONS.items():
-            more = "" if precision == "float64" else f", {precision}"
+        for more, dtype in PRECISIONS.items():
             for name in PEERS:
                 for n, times in ((1, ""), (16, ", 16")):
                     counts = np.full(len(found), n)
@@ -170,8 +170,7 @@ def _count(case: Case, dt: float) -> float:
     if bound.order:
         return float(bound.substeps)
     stepped = Stepped(scene, dt=dt)
-    y, k = stepped.lift(np.array(state)), stepped.numbers()
-    coefficients, variables = stepped.drive(y, control, k, np), stepped.unpack(y, control, k)
+    variables, coefficients = stepped.at(state, control)
     n = 1.0
     while n <= MOST_SUBSTEPS and not stepped.flow.within(variables, coefficients, dt / n, 0.0, np):
         n *= 2.0

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from lag_envs.report.cases import VARIANTS, Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
@@ -38,9 +36,8 @@ def _damped(name: str, decay: float, dt: float) -> Case:
 
 def _drag(scene: Scene) -> float:
     """Return the rate at which drag alone would slow down the motion, without control [1/s]."""
-    stepped = Stepped(scene)
-    found = stepped.drive(stepped.lift(np.zeros(len(scene.state_names))), 0.0, stepped.numbers(), np)
-    return float(found.damping_rate)
+    _, coefficients = Stepped(scene).at([0.0] * len(scene.state_names), 0.0)
+    return float(coefficients.damping_rate)
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import form_of, motion_constants_of
@@ -29,12 +29,9 @@ class Stepped:
 
     Examples
     --------
-    >>> from lag_envs.report.integrators import comparison
     >>> from lag_envs.scenes import PivotedBar
-    >>> bar = PivotedBar(track=None)
-    >>> rk4 = Stepped(bar, comparison("RK4", Stepped(bar).flow))
-    >>> rk4.simulate([2.0, 0.0], [0.0] * 4, 0.005)[-1].round(6).tolist()
-    [1.995538, -0.446313]
+    >>> [float(x) for x in Stepped(PivotedBar(track=None)).lift([0.0, 3.0])]
+    [0.0, 3.0, 1.0, 0.0]
     """
 
     def __init__(self, scene: Scene, flow: Flow | None = None, dt: float = 0.02) -> None:
@@ -69,6 +66,11 @@ class Stepped:
         """Return the lifted state at the end."""
         return self.form.pack(moved, y, [u], dt, k)
 
+    def at(self, state: ArrayLike, u: Any) -> tuple[list, Any]:
+        """Return the flow's variables and coefficients at a state under a control."""
+        y, k = self.lift(np.asarray(state, np.float64)), self.numbers()
+        return self.unpack(y, u, k), self.drive(y, u, k, np)
+
     def largest_majorant(self, dt: float) -> float:
         """Return the x of the bound up to which one series is certified."""
         return pendulum.largest_majorant(dt, self.flow.order or pendulum.ORDER)
@@ -80,13 +82,3 @@ class Stepped:
     def present(self) -> list[float]:
         """Return the constants of the code."""
         return [value for value in self.constants().values() if value != 0.0]
-
-    def simulate(self, state: ArrayLike, controls: ArrayLike, dt: float) -> NDArray[np.float64]:
-        """Step like `Scene.simulate`; rows after a refused step are NaN."""
-        given = np.asarray(controls, np.float64)
-        trajectory = np.full((len(given) + 1, self.width - (2 if self.angle is not None else 0)), np.nan)
-        trajectory[0] = state
-        self.stepper().compile_simulate()(
-            trajectory, given[:, None], dt, self.largest_majorant(dt), *self.present()
-        )
-        return trajectory

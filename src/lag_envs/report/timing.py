@@ -7,10 +7,10 @@ others, so that times compare methods.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from statistics import median
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import Flow
 
 Array = NDArray[np.float64]
-K = TypeVar("K")
 
 
 class FlowSteps:
@@ -41,8 +40,12 @@ class FlowSteps:
     Examples
     --------
     >>> from lag_envs.report.cases import Case
+    >>> from lag_envs.report.integrators import comparison
     >>> from lag_envs.scenes import PivotedBar
     >>> bar = PivotedBar(track=None)
+    >>> rk4 = FlowSteps(bar, comparison("RK4", Stepped(bar).flow))
+    >>> rk4.end(Case(bar, (2.0, 0.0), 0.0), 0.005, 4).round(6).tolist()
+    [1.995538, -0.446313]
     >>> case = Case(bar, (3.0, 0.0), 1.0)
     >>> end = bar.simulate(case.state, [case.control] * 50, 0.02)[-1]
     >>> FlowSteps(bar).end(case, 0.02, 50).tolist() == end.tolist()
@@ -138,18 +141,40 @@ class FlowSteps:
         return compile_function("batch", source, *(() if self.plain else (code.compile(),)))
 
     def fill(self, cases: Sequence[Case]) -> Array:
-        """Return the rows of a batch; the last block is padded with its first state."""
-        count = -(-len(cases) // BLOCK)
-        padded = [*cases, *[cases[0]] * (count * BLOCK - len(cases))]
-        y = self.stepped.lift(np.array([case.state for case in padded]))
-        columns = np.array([*y, [case.control for case in padded], np.ones(len(padded))])
-        return columns.reshape(len(columns), count, BLOCK).transpose(1, 0, 2).ravel()
+        """Return the rows of a batch."""
+        y = self.stepped.lift(np.array([case.state for case in cases]))
+        columns = np.array([*y, [case.control for case in cases], np.ones(len(cases))])
+        return blocks(columns, BLOCK).ravel()
 
     def states(self, rows: Array, count: int) -> Array:
         """Return the states of a batch, one per line."""
-        width = self.stepped.width + 2
-        columns = rows.reshape(-1, width, BLOCK).transpose(0, 2, 1).reshape(-1, width)
-        return columns[:count, : len(self.stepped.form.state_names)]
+        columns = unblocked(rows.reshape(-1, self.stepped.width + 2, BLOCK), count)
+        return columns[: len(self.stepped.form.state_names)].T
+
+
+def blocks(columns: Array, width: int) -> Array:
+    """Return columns in blocks, shape (blocks, rows, width); the last is padded with the first column.
+
+    Examples
+    --------
+    >>> blocks(np.array([[1.0, 2.0, 3.0]]), 2).tolist()
+    [[[1.0, 2.0]], [[3.0, 1.0]]]
+    """
+    rows, count = columns.shape
+    missing = -count % width
+    filled = np.concatenate([columns, np.repeat(columns[:, :1], missing, axis=1)], axis=1)
+    return np.ascontiguousarray(filled.reshape(rows, (count + missing) // width, width).transpose(1, 0, 2))
+
+
+def unblocked(found: Array, count: int) -> Array:
+    """Return the columns from the result of `blocks`.
+
+    Examples
+    --------
+    >>> unblocked(blocks(np.array([[1.0, 2.0, 3.0]]), 2), 3).tolist()
+    [[1.0, 2.0, 3.0]]
+    """
+    return found.transpose(1, 0, 2).reshape(found.shape[1], -1)[:, :count]
 
 
 class Sample(NamedTuple):
@@ -202,8 +227,8 @@ def at_once(kernels: FlowSteps, cases: Sequence[Case], steps: int, dt: float) ->
 
 
 def interleaved(
-    samples: Mapping[K, Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
-) -> dict[K, float]:
+    samples: Sequence[Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
+) -> list[float]:
     """Return each sample's time of a control step [ns], the median over rounds.
 
     Every round runs each sample once, so that a slow phase of the machine affects all of them.
@@ -211,17 +236,17 @@ def interleaved(
     Examples
     --------
     >>> ticks = iter(range(1000))
-    >>> interleaved({"a": Sample(lambda: None, 2)}, clock=lambda: next(ticks))
-    {'a': 500000000.0}
+    >>> interleaved([Sample(lambda: None, 2)], clock=lambda: next(ticks))
+    [500000000.0]
     """
-    times: dict[K, list[float]] = {name: [] for name in samples}
-    for sample in samples.values():
+    times: list[list[float]] = [[] for _ in samples]
+    for sample in samples:
         sample.prepare()
         sample.run()  # compiles, and warms up
     for _ in range(rounds):
-        for name, sample in samples.items():
+        for sample, found in zip(samples, times, strict=True):
             sample.prepare()
             before = clock()
             sample.run()
-            times[name].append((clock() - before) / sample.steps)
-    return {name: 1e9 * median(values) for name, values in times.items()}
+            found.append((clock() - before) / sample.steps)
+    return [1e9 * median(found) for found in times]

@@ -7,7 +7,7 @@ stepping; defeats are reported like wins. Sentences are made from the numbers, s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -272,25 +272,23 @@ def _summary(points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> Tab
 
 
 def _rival(comparison: Duel) -> str:
-    return (
-        f"{comparison.rival.label}: {comparison.ratio:.2g} ×"
-        if comparison.rival and comparison.ratio
-        else "none"
-    )
+    rival, ratio = comparison.rival, comparison.ratio
+    return f"{rival.label}: {ratio:.2g} ×" if rival and ratio else "none"
 
 
 def _orders(rows: Sequence[Row]) -> Table:
-    found = [r for r in rows if r["kind"] == "order"]
-    return Table(
+    return Table.of(
         "work_precision_orders",
         "Order of convergence, from the slope of the error of one step over its length, less one: the "
         "median over 24 problems on PivotedBar, with the shortest pair of steps h and 2h whose errors lie "
         "well above rounding.",
-        ["method", "order", "measured", "difference"],
-        [
-            [r["method"], r["order"], r["slope"], r["slope"] - r["order"] if r["slope"] is not None else None]
-            for r in found
-        ],
+        {
+            "method": "method",
+            "order": "order",
+            "measured": "slope",
+            "difference": lambda r: None if r["slope"] is None else r["slope"] - r["order"],
+        },
+        [r for r in rows if r["kind"] == "order"],
     )
 
 
@@ -301,12 +299,8 @@ def _failed(rows: Sequence[Row], problems: Sequence[JobResult]) -> Table:
         for row in rows
         if row.get("problem") and not row["problem"].startswith("not run")
     ]
-    return Table(
-        "work_precision_problems",
-        "What failed.",
-        ["scene or job", "where", "method", "problem"],
-        found,
-    )
+    columns = ["scene or job", "where", "method", "problem"]
+    return Table("work_precision_problems", "What failed.", columns, found)
 
 
 def _left(rows: Sequence[Row]) -> Table:
@@ -347,79 +341,69 @@ def _all(points: Sequence[WorkPrecisionPoint]) -> Table:
 
 def claims(rows: Sequence[Row], points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> list[Claim]:
     """Return the claims; whether they hold is measured, and README lists those that do not."""
-    made = [_fastest(found, horizon, target) for horizon, target in CLAIMED.items()]
     steps = [p for p in points if p.own and p.method == LAG_ENVS and p.horizon == "one step"]
     largest = max((p.worst for p in steps), default=math.nan)
-    made.append(
-        _claim(
-            "The error of one control step stays below 1e-15 on every scene",
-            steps,
-            lambda: largest < 1e-15,
-            lambda: f"largest {largest:.1e}, scenes measured: {len({p.variant for p in steps})}",
-        )
-    )
     finest = _finest(points)
     off = [f"{name} on {where}: {error:.1e}" for (name, where), error in finest.items() if error > ACCURATE]
-    made.append(
-        _claim(
-            "No form is fast because it is broken: at its finest setting every library, and every "
-            f"integrator of order 4 and more, errs by at most {ACCURATE:.0e} in one step",
-            finest,
-            lambda: not off,
-            lambda: ", ".join(off) if off else f"{len(finest)} forms; largest {max(finest.values()):.1e}",
-        )
-    )
     slopes = [
         (r["method"], abs(r["slope"] - r["order"])) for r in rows if r["kind"] == "order" and r["slope"]
     ]
     method, worst = max(slopes, key=lambda x: x[1], default=("", 0.0))
-    made.append(
+    same = _same_bits(rows)
+    return [
+        *(_fastest(found, horizon, target) for horizon, target in CLAIMED.items()),
+        _claim(
+            "The error of one control step stays below 1e-15 on every scene",
+            steps,
+            largest < 1e-15,
+            f"largest {largest:.1e}, scenes measured: {len({p.variant for p in steps})}",
+        ),
+        _claim(
+            "No form is fast because it is broken: at its finest setting every library, and every "
+            f"integrator of order 4 and more, errs by at most {ACCURATE:.0e} in one step",
+            finest,
+            not off,
+            ", ".join(off) or f"{len(finest)} forms; largest {max(finest.values(), default=0.0):.1e}",
+        ),
         _claim(
             "Every method converges with its order, within 0.2",
             slopes,
-            lambda: worst <= 0.2,
-            lambda: f"largest difference {worst:.2f}, {method}",
-        )
-    )
-    same = _same_bits(rows)
-    made.append(
+            worst <= 0.2,
+            f"largest difference {worst:.2f}, {method}",
+        ),
         _claim(
             "Batches that are timed end bit for bit where single trajectories do, for lag_envs and others",
             same,
-            lambda: all(same),
-            lambda: f"{sum(same)} of {len(same)}",
-        )
-    )
-    return made
+            all(same),
+            f"{sum(same)} of {len(same)}",
+        ),
+    ]
 
 
-def _claim(text: str, measured: Any, holds: Callable[[], bool], evidence: Callable[[], str]) -> Claim:
-    return Claim(text, holds(), evidence()) if measured else Claim(text, None, "not measured")
+def _claim(text: str, measured: Any, holds: bool, evidence: str) -> Claim:
+    return Claim(text, holds, evidence) if measured else Claim(text, None, "not measured")
 
 
 def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
     here = [d for d in found if d.horizon == horizon and d.target == target and (d.own or d.rival)]
-    lost = [d for d in here if d.lost]
-
-    def evidence() -> str:
-        ratios = [d.ratio for d in here if d.ratio is not None]
-        if lost:
-            faster = "; ".join(
-                f"{d.where}: {d.rival.label}, {f'{d.ratio:.2g} ×' if d.ratio else 'lag_envs not at all'}"
-                for d in lost
-                if d.rival
-            )
-            return f"{len(here) - len(lost)} of {len(here)}; faster: {faster}"
-        if not ratios:
-            return f"{len(here)} of {len(here)}; nobody else gets there"
-        low, high = min(ratios), max(ratios)
-        return f"{len(here)} of {len(here)}; the fastest rivals take {low:.2g} to {high:.2g} × our time"
-
+    faster = [
+        f"{d.where}: {d.rival.label}, {f'{d.ratio:.2g} ×' if d.ratio else 'lag_envs not at all'}"
+        for d in here
+        if d.lost and d.rival
+    ]
+    ratios = [d.ratio for d in here if d.ratio is not None]
+    evidence = f"{len(here) - len(faster)} of {len(here)}; "
+    if faster:
+        evidence += f"faster: {'; '.join(faster)}"
+    elif ratios:
+        evidence += f"the fastest rivals take {min(ratios):.2g} to {max(ratios):.2g} × our time"
+    else:
+        evidence += "nobody else gets there"
     return _claim(
         f"{horizon.capitalize()}: nobody reaches an error of {target:.0e} in less time than lag_envs as "
         "shipped, alone or in a batch",
         here,
-        lambda: not lost,
+        not faster,
         evidence,
     )
 

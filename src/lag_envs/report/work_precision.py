@@ -207,16 +207,11 @@ def variant_rivals(variant: str, horizon: str, family: str, quick: bool) -> list
     if family == "compiled":
         equation = Problems(problems(horizon, ensemble(variant, 1))).equation
         methods = [m for m in CompiledMethod.methods(equation) if not quick or m in QUICK_METHODS]
-        shipped = [ShippedStepping(ShippedStepping.METHOD, 1)]
+        shipped = [ShippedStepping()]
         if plan.seconds is not None:  # a constant control may be stepped with any dt
-            shipped += [
-                *(ShippedStepping(ShippedStepping.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)),
-                ShippedStepping(ShippedStepping.ONE_CALL, 1),
-            ]
-        return [
-            *shipped,
-            *(CompiledMethod(method, n) for method in methods for n in plan.substeps),
-        ]
+            shipped += [ShippedStepping(n) for n in (1 / 8, 1 / 4, 1 / 2, 2)]
+            shipped += [ShippedStepping(one_call=True)]
+        return [*shipped, *(CompiledMethod(method, n) for method in methods for n in plan.substeps)]
     kind = peers.PEERS[family]
     some = slice(1, None, 3) if quick else slice(None)
     return [kind(method, setting) for method, found in kind.settings.items() for setting in found[some]]
@@ -261,10 +256,10 @@ def variant_points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                         at_rounding = row["error"] < 4.0 * ROUNDING
                         no_better = row["error"] > 0.7 * done.get(rival.method, math.inf)
                         done[rival.method] = -1.0 if at_rounding or no_better else row["error"]
-            clock = timed(ShippedStepping(ShippedStepping.METHOD, 1), base, dt, steps, together)
-            times = interleaved(dict(enumerate([clock, *samples])), 5 if quick else 9)
-            for i, row in enumerate(found):
-                yield row | {"ns": times[i + 1], "clock": times[0]}
+            clock = timed(ShippedStepping(), base, dt, steps, together)
+            own, *times = interleaved([clock, *samples], 5 if quick else 9)
+            for row, ns in zip(found, times, strict=True):
+                yield row | {"ns": ns, "clock": own}
 
 
 def point(
