@@ -46,7 +46,7 @@ DIFFERENCE = 1e-5
 MODEL, NORMALISATION, RESULT = "model.zip", "vecnormalize.pkl", "result.json"
 
 
-class ExportError(Exception):
+class ExportError(UserError):
     """A model that cannot be exported; the text says why."""
 
 
@@ -547,8 +547,6 @@ def run_export(args: argparse.Namespace) -> int:
         )  # fmt: skip
     except ImportError as error:
         raise UserError(f'{error.name} is missing: pip install "lag-envs[agents,leaderboard]"') from error
-    except ExportError as error:
-        raise UserError(str(error)) from error
     alike = f"largest difference of an action from the models': {off:.1e}, over {count} observations of each"
     print(
         f"{submission.folder}: {submission.env}, {submission.name}, {len(submission.policies)} policies\n"

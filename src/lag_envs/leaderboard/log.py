@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
+from lag_envs.errors import UserError
 from lag_envs.leaderboard import fields
 from lag_envs.leaderboard.fields import Strict, between, checked, shown_ascii
 from lag_envs.leaderboard.files import read_plain
@@ -35,7 +36,7 @@ REMEDY = "restore it from version control"
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
 
 
-class BoardError(Exception):
+class BoardError(UserError):
     """A request that the board cannot fulfil; the text says why, and what to do."""
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from lag_envs.leaderboard.fields import ascii_text
 from lag_envs.leaderboard.protocol import FOLDER_BYTES
 from lag_envs.workers import as_they_finish, cluster, processes
 
@@ -60,6 +61,21 @@ def map_submissions(
     else:
         for folder in folders:
             yield folder, _caught(function, folder)
+
+
+def with_bar(function: Callable[..., Any], folder: Path) -> Any:
+    """Call a function of a folder and of its progress, which a bar shows on a terminal."""
+    from tqdm import tqdm
+
+    with tqdm(
+        desc=ascii_text(folder.name), unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5
+    ) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return function(folder, progress=show)
 
 
 def _caught(function: Work, folder: Path) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -88,7 +88,7 @@ def shown_episodes(result: Mapping[str, Any]) -> tuple[int, dict[str, int]]:
 def finish(
     board: Board,
     only: Sequence[str] | None = None,
-    parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
+    parallel_map: Callable[..., Iterable[tuple[Path, Any]]] | None = None,
     tell: Callable[[BoardEntry, str], Any] = lambda entry, what: None,
 ) -> int:
     """Verify all pending submissions that have a nonce.
