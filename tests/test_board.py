@@ -339,8 +339,7 @@ def test_board_data(board):
     assert (data["protocol"], data["made"]) == (1, "2026-01-01")
     assert [e["id"] for e in data["environments"]] == list(module.TASKS)
     found = data["environments"][0]
-    assert found["known"]["best"] == known_returns(ENV).best and found["title"] and found["picture"]["shapes"]
-    assert found["dt"] == 0.02 and "upright" in found["goal"]
+    assert found["known"]["best"] == known_returns(ENV).best and "upright" in found["goal"]
     first, second = found["rows"]
     assert (first["id"], first["rank"], second["rank"]) == (best, 1, 2)
     assert first["score"] == pytest.approx(0.9, abs=0.01) and first["interval"][0] <= first["score"]

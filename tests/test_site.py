@@ -210,6 +210,12 @@ def test_episodes_are_written_as_columns():
         assert len(json.dumps(found)) < 1.4 * len(json.dumps(replay))
 
 
+def test_a_page_shows_the_scene_of_its_environment(data):
+    page = render(data)[0]["PivotedBar-v0.html"]
+    shown = json.loads(re.findall(r'id="data">(.*?)<', page)[0])
+    assert shown["title"] and shown["picture"]["shapes"] and shown["dt"] == 0.02
+
+
 def test_episodes_that_cannot_be_drawn_are_kept():
     replay = {"states": [[0.0]], "actions": [], "rewards": [], "target": None}
     for env_id in ("Gone-v0", "PivotedBar-v0"):

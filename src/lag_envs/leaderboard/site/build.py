@@ -22,7 +22,7 @@ from markupsafe import Markup
 from lag_envs import store
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import driving
-from lag_envs.leaderboard.site.scenery import Scenery, scenery_data
+from lag_envs.leaderboard.site.scenery import Scenery, page_json, scenery_data
 
 #: Lists the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
@@ -171,16 +171,16 @@ def render(
             replays, live = row.pop("replays"), row.pop("agent")
             row["file"] = None
             row["live"] = (
-                keep(f"{board['page']}-{i}-live", "js", f"lagEnvs.put({_json(live)});\n")
+                keep(f"{board['page']}-{i}-live", "js", f"lagEnvs.put({page_json(live)});\n")
                 if live and code
                 else None
             )
             if replays:
                 # The script that fetches the file knows it by this key.
                 episodes = [scenery.episode(replay) for replay in replays]
-                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({_json(episodes)});\n")
+                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({page_json(episodes)});\n")
                 if row["name"] == board["shown"] and not board["film"]:
-                    first = _json(episodes[:1])
+                    first = page_json(episodes[:1])
                     board["film"] = keep(f"{board['page']}-film", "js", f"lagEnvs.put({first});\n")
         preview = scenery.preview(board.pop("states"), board.pop("goal_of_states")) if url else None
         board["preview"] = preview and keep(board["page"], "png", preview)
@@ -198,7 +198,7 @@ def render(
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
         "made": data["made"], "style": style,
         "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
-        "embed": _embedded, "url": url and url.rstrip("/") + "/",
+        "embed": lambda value: Markup(page_json(value)), "url": url and url.rstrip("/") + "/",
         "site": site, "source": source, "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
@@ -485,16 +485,6 @@ def _clean(value: Any) -> Any:
     if isinstance(value, str):
         return re.sub(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _json(value: Any) -> str:
-    """Return JSON that cannot end a script element and means the same in JavaScript."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _embedded(value: Any) -> Markup:
-    return Markup(_json(value))
 
 
 def _manifest(out: Path) -> set[str]:

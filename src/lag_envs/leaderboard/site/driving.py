@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -17,7 +16,7 @@ from lag_envs.leaderboard.architecture import Array, Head
 from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, Linear, Network
 from lag_envs.leaderboard.policies import ControllerPolicy, SubmittedPolicy
-from lag_envs.leaderboard.site.scenery import picture_data
+from lag_envs.leaderboard.site.scenery import page_json, picture_data
 from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_names
@@ -62,8 +61,7 @@ def script_of(kind: type[Task]) -> str:
     env = Unfused(task)
     program, names = env.program, ", ".join(env.program.names)
     constants = ", ".join(map(_number, program.constants))
-    about = json.dumps(_about(kind, env), separators=(",", ":"), allow_nan=False)
-    about = about.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    about = page_json(_about(kind, env))
     return (
         f'"use strict";\n(() => {{\n{program.javascript}'
         f"lagEnvs.put({{ functions: {{ {names} }}, constants: [{constants}], about: {about} }});\n}})();\n"
