@@ -23,13 +23,10 @@ from lag_envs.scores import known_returns, score
 from lag_envs.tasks import incline, pivoted_bar
 
 
-@pytest.fixture(autouse=True)
-def fakes(monkeypatch):
-    fake_submissions.install(monkeypatch.setattr)
-
-
 @pytest.fixture
-def board(tmp_path):
+def board(tmp_path, monkeypatch):
+    """A board for fake submissions."""
+    fake_submissions.install(monkeypatch.setattr)
     return Board(tmp_path / "board")
 
 
@@ -297,9 +294,8 @@ def test_map_submissions(tmp_path, jobs):
 
 
 @pytest.mark.slow
-def test_verifying_on_ray_is_verifying_here(tmp_path, monkeypatch):
+def test_verifying_on_ray_is_verifying_here(tmp_path):
     pytest.importorskip("ray")
-    monkeypatch.undo()  # the real ones
     kinds = {"kind": "controller", "license": "MIT", "authors": ["A"]}
     for name in ("full damping", "switching line"):
         policy = {"architecture": "controller", "name": name}
@@ -435,11 +431,6 @@ def test_coarse_value_functions():
     best = max(range(theta["n"]), key=lambda i: value["values"][i][theta_dot["n"] // 2])
     assert best == theta["n"] // 2  # upright
     assert coarse(incline.Brake.id, None)["axes"][1]["label"] == "x_dot"
-
-
-def test_a_board_that_does_not_exist(board):
-    with pytest.raises(BoardError, match=r"there is no board in .*add FOLDER --board .* begins one there"):
-        board.read()
 
 
 def test_an_empty_board(board):

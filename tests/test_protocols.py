@@ -19,13 +19,10 @@ from lag_envs.scores import known_returns
 from lag_envs.tasks import pivoted_bar
 
 
-@pytest.fixture(autouse=True)
-def fakes(monkeypatch):
-    fake_submissions.install(monkeypatch.setattr)
-
-
 @pytest.fixture
-def board(tmp_path):
+def board(tmp_path, monkeypatch):
+    """A board for fake submissions."""
+    fake_submissions.install(monkeypatch.setattr)
     return Board(tmp_path / "board")
 
 
