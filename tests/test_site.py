@@ -25,18 +25,13 @@ def data():
     return board_pages.data()
 
 
-@pytest.fixture(scope="module")
-def hostile():
-    return board_pages.hostile()
-
-
 def unpacked(column, n, unit):
     """Return the numbers of a column."""
     return unit * np.cumsum(np.cumsum(column) if isinstance(column, list) else [column] + [0] * (n - 1))
 
 
-def test_what_comes_from_submissions_is_escaped(hostile):
-    pages, files = render(hostile)
+def test_what_comes_from_submissions_is_escaped():
+    pages, files = render(board_pages.hostile())
     for name, text in (pages | files).items():
         if "/site-" in name:
             continue
