@@ -567,7 +567,7 @@ def read_all(file: int) -> bytes:
     return b"".join(parts)
 
 
-def write_event(log: int, told: dict[str, Any]) -> LogLine:
+def write_event(log: int, told: dict[str, Any]) -> None:
     """Append an event as a line and flush it to the disk, all or nothing.
 
     Raises
@@ -583,7 +583,7 @@ def write_event(log: int, told: dict[str, Any]) -> LogLine:
     line = b"\n" if content and not content.endswith(b"\n") else b""
     told = told | {"prev": hashlib.sha256(content + line).hexdigest()}
     try:
-        event = checked(_EVENTS, told)
+        checked(_EVENTS, told)
     except ValueError as error:
         raise BoardError(f"this cannot be logged: {error}") from None
     line += json.dumps(told, ensure_ascii=False).encode() + b"\n"
@@ -594,4 +594,3 @@ def write_event(log: int, told: dict[str, Any]) -> LogLine:
         os.ftruncate(log, len(content))
         raise
     os.fsync(log)
-    return LogLine((content + line).count(b"\n"), event)

@@ -6,7 +6,6 @@ each file of arrays, and only then the arrays. Bad input is refused before more 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -36,7 +35,7 @@ from lag_envs.leaderboard.fields import (
     line,
     shown_ascii,
 )
-from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.files import digest_of, read_plain
 from lag_envs.leaderboard.log import load_json
 from lag_envs.leaderboard.names import wordless
 from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
@@ -379,14 +378,6 @@ def _check_different(policies: Sequence[tuple[int, SubmittedPolicy]]) -> None:
             raise Refused(
                 f"the policies of seeds {other} and {seed} are the same; each needs its own training"
             )
-
-
-def digest_of(files: Mapping[str, bytes]) -> str:
-    """Return the digest of a submission's files: the SHA-256 of their names and contents."""
-    total = hashlib.sha256()
-    for name in sorted(files):
-        total.update(f"{name}\n{len(files[name])}\n".encode() + files[name])
-    return total.hexdigest()
 
 
 # --- arrays -------------------------------------------------------------------------------------------------
