@@ -154,6 +154,9 @@ def render(
         files[name] = content
         return name
 
+    def keep_data(stem: str, value: Any) -> str:
+        return keep(stem, "js", f"lagEnvs.put({page_json(value)});\n")
+
     style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
     script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
     drive = keep("drive", "js", (STATIC / "drive.js").read_text("utf-8"))
@@ -170,18 +173,13 @@ def render(
             row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
             replays, live = row.pop("replays"), row.pop("agent")
             row["file"] = None
-            row["live"] = (
-                keep(f"{board['page']}-{i}-live", "js", f"lagEnvs.put({page_json(live)});\n")
-                if live and code
-                else None
-            )
+            row["live"] = keep_data(f"{board['page']}-{i}-live", live) if live and code else None
             if replays:
                 # The script that fetches the file knows it by this key.
                 episodes = [scenery.episode(replay) for replay in replays]
-                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({page_json(episodes)});\n")
+                row["file"] = keep_data(f"{board['page']}-{i}", episodes)
                 if row["name"] == board["shown"] and not board["film"]:
-                    first = page_json(episodes[:1])
-                    board["film"] = keep(f"{board['page']}-film", "js", f"lagEnvs.put({first});\n")
+                    board["film"] = keep_data(f"{board['page']}-film", episodes[:1])
         preview = scenery.preview(board.pop("states"), board.pop("goal_of_states")) if url else None
         board["preview"] = preview and keep(board["page"], "png", preview)
         boards.append(board)
@@ -192,12 +190,12 @@ def render(
     )  # fmt: skip
     templates.filters |= {
         "number": rounded_text, "steps": count_text, "duration": duration, "seconds": seconds,
-        "percent": percent, "condition": condition, "about": _about, "place": place_of,
+        "percent": percent, "condition": condition, "about": _about, "place": place_of, "lowest": lowest,
     }  # fmt: skip
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
         "made": data["made"], "style": style,
-        "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
+        "script": script, "drive": drive, "protocol": data["protocol"],
         "embed": lambda value: Markup(page_json(value)), "url": url and url.rstrip("/") + "/",
         "site": site, "source": source, "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
@@ -358,17 +356,15 @@ def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequ
 # --- numbers as text --------------------------------------------------------------------------------------
 
 
-def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
-    """Return a column's sort key."""
-    value = row[key]
-    if key == "name":
-        return str(value).casefold()
-    if key == "success" and isinstance(value, Mapping):
-        return value.get("rate")
-    if isinstance(value, Mapping):
-        numbers = [x for x in value.values() if isinstance(x, int | float)]
-        return min(numbers, default=None)
-    return value
+def lowest(scores: Mapping[str, float | None] | None) -> float | None:
+    """Return the lowest of some scores; None if there are none.
+
+    Examples
+    --------
+    >>> lowest({"noise": 0.9, "pushes": 0.8, "late": None}), lowest({}), lowest(None)
+    (0.8, None, None)
+    """
+    return min((x for x in (scores or {}).values() if x is not None), default=None)
 
 
 def rounded_text(value: Any, digits: int = 3) -> str:
