@@ -13,7 +13,7 @@ from fake_submissions import ENV, write
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import submission
 from lag_envs.leaderboard.board import Board, BoardError, id_of
-from lag_envs.leaderboard.parallel import map_submissions, packed
+from lag_envs.leaderboard.parallel import map_submissions
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.leaderboard.standings import board_data
@@ -308,18 +308,6 @@ def test_verifying_on_ray_is_verifying_here(tmp_path):
     assert here["refused"] == there["refused"] and "refused" in here["refused"]
     for name in ("full damping", "switching line"):
         assert here[name]["policies"] == there[name]["policies"]
-
-
-def test_only_plain_small_files_travel(tmp_path):
-    folder = write(tmp_path / "a")
-    assert sorted(packed(folder)) == ["policy_0.safetensors", "submission.toml"]
-    with (folder / "large").open("wb") as out:
-        out.truncate(10**9)
-    assert packed(folder) is None
-    (folder / "large").unlink()
-    (folder / "link").symlink_to("/etc/passwd")
-    assert packed(folder) is None
-    assert packed(tmp_path / "none") is None
 
 
 # --- the page's data ---
