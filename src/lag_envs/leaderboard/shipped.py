@@ -1,4 +1,4 @@
-"""The policies that come with the package: the board's best for each environment, as data.
+"""The policies that come with the package: the board's best network or table for each environment.
 
 ``python -m lag_envs.leaderboard.shipped`` chooses them from a clone's board and writes them beside this file.
 Together they have at most `MOST` bytes; if the best ones are larger, some are replaced by smaller ones, so

@@ -694,7 +694,7 @@
     const copy = button("copy", "Copy link");
     const share = make("div", { class: "share" }, link, copy);
     const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
-    root.replaceChildren(stage, bar, readout, verdict, share, panel, said);
+    root.replaceChildren(verdict, stage, bar, readout, share, panel, said);
     copy.disabled = watch.hidden = episodeLabel.hidden = true;
 
     const hands = new Hands(about, () => {
@@ -718,9 +718,17 @@
       (control) => (control.meaning ? "" : words(control)),
       (unit) => ` in ${unit}`,
     );
+    // Without a key the first of listed actions acts, which may push too.
+    const unasked = about.controls
+      .map(({ name, unit, values }, i) => (values[about.rest[i]] ? ` Without a key, ${symbol(name)} is ${text(values[about.rest[i]])} ${unit}.` : ""))
+      .join("");
     const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
-    const starting = (keys) =>
-      `${keys ? `${keys}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space or a tap starts.${nothing}`;
+    const touched = matchMedia("(hover: none)").matches;
+    const starting = (keys) => {
+      const by = touched ? "A tap starts. Then hold a finger on the picture: the farther from the middle, the stronger."
+        : `${keys}; or use the pointer or a gamepad. Space or a tap starts.`;
+      return `${keys ? by : "There is nothing to control here: just watch. Space or a tap starts."}${unasked}${nothing}`;
+    };
     stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
 
     let { constants } = code;
@@ -774,6 +782,11 @@
       ghostSelect.value = chosen;
     }
 
+    /** What a stored episode is, with the seed of its start if that is known. */
+    function seeded({ label: name = "episode", return: total, reset_seed: start }) {
+      return `${name}${start === undefined ? "" : `, seed ${start}`}, return ${text(total, 2)}`;
+    }
+
     async function chooseGhost() {
       const [kind, row] = ghostSelect.value.split(":");
       const asked = ghostSelect.value;
@@ -790,7 +803,7 @@
         if (ghostSelect.value !== asked) return;
         ghost = found;
         if (ghost.replays) {
-          episodeSelect.replaceChildren(...ghost.replays.map((replay, i) => option(String(i), `${replay.label ?? "episode"}, return ${text(replay.return, 2)}`)));
+          episodeSelect.replaceChildren(...ghost.replays.map((replay, i) => option(String(i), seeded(replay))));
           episodeLabel.hidden = false;
           chooseEpisode();
           return;
@@ -798,14 +811,16 @@
         if (ghost.seed !== undefined) seed = ghost.seed;
       }
       restart();
+      tell(starting(how), starting(heard));
       if (ghost?.act) warmUp();
     }
 
     function chooseEpisode() {
       ghost.replay = ghost.replays[Number(episodeSelect.value)] ?? ghost.replays[0];
-      if (ghost.replay.reset_seed !== undefined) seed = big(ghost.replay.reset_seed);
-      else tell("The seed of this episode is not known: the ghost starts elsewhere.");
+      const start = ghost.replay.reset_seed;
+      if (start !== undefined) seed = big(start);
       restart();
+      tell(start === undefined ? "The seed of this episode is not known: the ghost starts elsewhere." : starting(how), starting(heard));
     }
 
     function startGhost() {

@@ -328,6 +328,11 @@
     const frame = (now) => {
       if (!running || !seen) return;
       begun ||= now;
+      // It rests while somebody drives, whose frames it would slow down.
+      if (find(".stage[data-driving]")) {
+        requestAnimationFrame(frame);
+        return;
+      }
       const length = replay.end * replay.dt;
       const time = Math.min(((now - begun) / 1000) % (length + 1), length);
       const at = Math.min(Math.floor(time / replay.dt), replay.end - 1);
