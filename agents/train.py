@@ -43,7 +43,7 @@ from lag_envs.own_files import is_file
 from lag_envs.scores import score
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
-from lag_envs.workers import SpreadError, check_address, died
+from lag_envs.workers import check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
@@ -152,10 +152,7 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
             folder = args.output / env / algo / f"seed{seed}"
             runs.append(Run(folder, env, algo, seed, steps, hyper, source))
     if args.ray:  # before anything is removed
-        try:
-            check_address(args.ray)
-        except SpreadError as error:
-            raise UserError(str(error)) from error
+        check_address(args.ray)
     for run in runs:
         if args.new:
             run.remove()
@@ -278,18 +275,15 @@ def here(runs: Sequence[Run]) -> Iterator[Callable]:
 @contextmanager
 def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
     """Train runs on a Ray cluster; otherwise like `train_in_processes`."""
-    try:
-        with workers.cluster(address, [Path(__file__).parent]) as submit:
-            from ray.util.queue import Queue
+    with workers.cluster(address, [Path(__file__).parent]) as submit:
+        from ray.util.queue import Queue
 
-            events, futures = Queue(), {}
-            for run in runs:
-                file = run.path(CHECKPOINT)
-                checkpoint = file.read_bytes() if file.exists() else None
-                futures[submit(_there, vars(run) | {"folder": None}, checkpoint, events)] = run
-            yield partial(poll, events, futures)
-    except SpreadError as error:
-        raise UserError(str(error)) from error
+        events, futures = Queue(), {}
+        for run in runs:
+            file = run.path(CHECKPOINT)
+            checkpoint = file.read_bytes() if file.exists() else None
+            futures[submit(_there, vars(run) | {"folder": None}, checkpoint, events)] = run
+        yield partial(poll, events, futures)
 
 
 def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:

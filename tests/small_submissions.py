@@ -11,6 +11,9 @@ ENV = incline.Tilt.id
 ABOUT = {"env": ENV, "name": "An agent", "authors": ["A. Nobody"], "license": "MIT"}
 TRAINING = {"env_steps": 1000, "seconds": 2.5, "hardware": "abacus"}
 NET = {"architecture": "mlp", "hidden": [3], "activation": "tanh", "squash": "clip"}
+#: A network for ReLU whose numbers overflow.
+HUGE = {"weight_0": np.full((3, 4), 1e308), "weight_1": np.array([[1e308, -1e308, 0.0]])}
+HUGE |= {"bias_0": np.zeros(3), "bias_1": np.zeros(1)}
 LINEAR = {"gain": np.array([-1.0, -1.0, -3.0, 1.0]), "offset": np.zeros(1)}
 FEEDBACK = {"architecture": "linear"}
 GRID = {"axis_0": np.array([-1.0, 1.0]), "axis_1": np.array([0.0, 1.0, 2.0]), "table": np.zeros((2, 3))}

@@ -9,6 +9,7 @@ from small_submissions import (
     ABOUT,
     FEEDBACK,
     GRID,
+    HUGE,
     LINEAR,
     NET,
     TABLE,
@@ -22,8 +23,9 @@ from small_submissions import (
 from lag_envs.leaderboard import alike
 from lag_envs.leaderboard.alike import Likeness, check_twins
 from lag_envs.leaderboard.board import Board, others
-from lag_envs.leaderboard.pending import Neighbours
+from lag_envs.leaderboard.pending import Neighbours, finish
 from lag_envs.leaderboard.ranking import policy_error
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.tasks import incline
 
@@ -117,9 +119,9 @@ def table_of(submission):
     return table
 
 
-def changed(submission, change, folder, seed=0):
+def changed(submission, change, folder):
     """Write a submission in which every policy was changed."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     arrays = {s: change(policy.arrays, rng) for s, policy in submission.policies}
     given = ABOUT | {"env": submission.env, "policy": table_of(submission), "training": TRAINING}
     return write(folder, **given, arrays=arrays)
@@ -128,9 +130,9 @@ def changed(submission, change, folder, seed=0):
 # --- our own ------------------------------------------------------------------------------------------------
 
 
-def own_entries(kind="learned"):
-    """Return the submissions of a kind on the repository's board, by id."""
-    return sorted(entry.id for entry in BOARD.read().all if entry.kind == kind and entry.protocol == 1)
+def own_entries():
+    """Return the ids of learners' submissions on the repository's board."""
+    return sorted(entry.id for entry in BOARD.read().all if entry.kind == "learned" and entry.protocol == 1)
 
 
 def error_of(id):
@@ -257,9 +259,7 @@ def test_equal_returns_tell_nothing_where_all_are_equal(monkeypatch, tmp_path):
 
 
 def test_a_policy_that_fails_acts_like_no_other(tmp_path):
-    numbers = {"weight_0": np.full((3, 4), 1e308), "bias_0": np.zeros(3)}
-    numbers |= {"weight_1": np.array([[1e308, -1e308, 0.0]])}
-    arrays = {s: numbers | {"bias_1": np.full(1, float(s))} for s in range(5)}
+    arrays = {s: HUGE | {"bias_1": np.full(1, float(s))} for s in range(5)}
     failing = learned(tmp_path / "failing", policy=NET | {"activation": "relu"}, arrays=arrays)
     first = learned(tmp_path / "first")
     assert Likeness(first.env, "n")(failing, first, 1.0) == alike.FAR
@@ -283,9 +283,6 @@ def test_five_trainings_are_five(tmp_path, size):
 
 def test_on_a_board(tmp_path):
     """From adding to the ranking, with real submissions."""
-    from lag_envs.leaderboard.pending import finish
-    from lag_envs.leaderboard.standings import board_data
-
     board = Board(tmp_path / "board")
     policy = {"architecture": "linear"}
     gains = {"A": 1.0, "B": 1.0 + 1e-6, "C": 0.5}

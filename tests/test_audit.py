@@ -40,29 +40,25 @@ def commit(board, message="change"):
     return git(board.folder.parent, "rev-parse", "HEAD")
 
 
-def fill(board, tell=lambda: None):
-    """Run a board through three rounds: a superseded, a withdrawn, a cloned submission and others."""
+def fill(board):
+    """Run a board through two protocols: a withdrawn, a cloned submission and another."""
     source = board.folder.parent / "sources"
 
     def add(name, **told):
         return board.add(fake_submissions.load(write(source / f"{name}-{len(told)}", name, **told))).id
 
-    def settle(source):
-        tell()
-        value = git(board.folder.parent, "rev-parse", "HEAD") if source == "commit" else source
-        board.publish(value, source)
+    def settle():
+        board.publish(commit(board), "commit")
         assert finish(board) == 0
 
-    kind = "commit" if tell else "https://example.org/beacon"
     add("PPO", score=0.8, acts="x")
     gone = add("SAC", score=0.7)
-    settle(kind)
+    settle()
     board.open()
     add("clone", score=0.81, acts="x", authors=["B"])
-    settle(kind if kind == "commit" else "https://example.org/beacon/2")
+    settle()
     board.withdraw(gone, "no more")
-    tell()
-    return board
+    commit(board)
 
 
 @pytest.fixture
@@ -81,7 +77,7 @@ def filled(tmp_path_factory):
     board = Board(folder / "board")
     with pytest.MonkeyPatch.context() as patch:
         fake_submissions.install(patch.setattr)
-        fill(board, lambda: commit(board))
+        fill(board)
     return board
 
 
@@ -135,19 +131,17 @@ def entry_of(board, name="PPO"):
     return next(e for e in board.read().entries.values() if e.name == name)
 
 
-def edit(board, change, note=True, name="PPO"):
-    """Change a result, and log its new hash."""
-    entry = entry_of(board, name)
+def edit(board, change, entry=None):
+    """Change a result; return the log's events with its new hash."""
+    entry = entry or entry_of(board)
     path = board.result_file(entry)
     result = json.loads(gzip.decompress(path.read_bytes()))
     change(result)
     path.write_bytes(gzip.compress(json.dumps(result).encode(), mtime=0))
-    if note:
-        told = lines(board)
-        event = next(e for e in told if e.get("sha256") == entry.sha256)
-        event["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        return told
-    return None
+    told = lines(board)
+    event = next(e for e in told if e.get("sha256") == entry.sha256)
+    event["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return told
 
 
 def better(result):
@@ -181,7 +175,7 @@ def test_everything_is_played_again(board):
 
 
 def test_a_result_is_edited(board):
-    edit(board, better, note=False)
+    edit(board, better)
     assert "line 10: " in refused(board) and "is not the file that was verified; restore it" in refused(board)
     assert "results" in wrong(board)
 
@@ -228,7 +222,6 @@ def test_a_result_is_edited_so_that_it_agrees_with_itself(board):
     ],
 )  # fmt: skip
 def test_part_of_a_result_is_edited(board, change, check, monkeypatch):
-    monkeypatch.setattr("lag_envs.leaderboard.results.code_digest", lambda: "0" * 64)
     monkeypatch.setattr(audit, "code_digest", lambda: "0" * 64)
     relog(board, edit(board, change))
     shutil.rmtree(board.folder.parent / ".git")
@@ -323,23 +316,16 @@ def test_name_and_files_and_digest_are_edited(board):
     relog(board, told)
     shutil.rmtree(board.folder.parent / ".git")
     assert "is of digest" in refused(board)
-    for number in (1, 2):
-        old = board.read().boards[number][entry.id]
-        path = board.result_file(old)
-        result = json.loads(gzip.decompress(path.read_bytes()))
+    first_seed = audit.protocol.first_seed
+
+    def moved(result):
         result["digest"] = digest
-        first = audit.protocol.first_seed(entry.digest, old.nonce, 0)
         for replay in result["replays"]:
-            policy = replay["seed"]
-            replay["reset_seed"] += audit.protocol.first_seed(digest, old.nonce, policy)
-            replay["reset_seed"] -= audit.protocol.first_seed(entry.digest, old.nonce, policy)
-        assert first
-        path.write_bytes(gzip.compress(json.dumps(result).encode(), mtime=0))
-        told = lines(board)
-        next(e for e in told if e.get("sha256") == old.sha256)["sha256"] = hashlib.sha256(
-            path.read_bytes()
-        ).hexdigest()
-        relog(board, told)
+            given = result["nonce"], replay["seed"]
+            replay["reset_seed"] += first_seed(digest, *given) - first_seed(entry.digest, *given)
+
+    for number in (1, 2):
+        relog(board, edit(board, moved, board.read().boards[number][entry.id]))
     assert refused(board) == ""
     assert "other returns than episodes" in wrong(board)["scores"][0]
 

@@ -13,7 +13,7 @@ from fake_submissions import ENV, write
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import submission
 from lag_envs.leaderboard.board import Board, BoardError, id_of
-from lag_envs.leaderboard.parallel import map_submissions, packed
+from lag_envs.leaderboard.parallel import map_submissions
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.leaderboard.standings import board_data
@@ -23,13 +23,10 @@ from lag_envs.scores import known_returns, score
 from lag_envs.tasks import incline, pivoted_bar
 
 
-@pytest.fixture(autouse=True)
-def fakes(monkeypatch):
-    fake_submissions.install(monkeypatch.setattr)
-
-
 @pytest.fixture
-def board(tmp_path):
+def board(tmp_path, monkeypatch):
+    """A board for fake submissions."""
+    fake_submissions.install(monkeypatch.setattr)
     return Board(tmp_path / "board")
 
 
@@ -297,9 +294,8 @@ def test_map_submissions(tmp_path, jobs):
 
 
 @pytest.mark.slow
-def test_verifying_on_ray_is_verifying_here(tmp_path, monkeypatch):
+def test_verifying_on_ray_is_verifying_here(tmp_path):
     pytest.importorskip("ray")
-    monkeypatch.undo()  # the real ones
     kinds = {"kind": "controller", "license": "MIT", "authors": ["A"]}
     for name in ("full damping", "switching line"):
         policy = {"architecture": "controller", "name": name}
@@ -312,18 +308,6 @@ def test_verifying_on_ray_is_verifying_here(tmp_path, monkeypatch):
     assert here["refused"] == there["refused"] and "refused" in here["refused"]
     for name in ("full damping", "switching line"):
         assert here[name]["policies"] == there[name]["policies"]
-
-
-def test_only_plain_small_files_travel(tmp_path):
-    folder = write(tmp_path / "a")
-    assert sorted(packed(folder)) == ["policy_0.safetensors", "submission.toml"]
-    with (folder / "large").open("wb") as out:
-        out.truncate(10**9)
-    assert packed(folder) is None
-    (folder / "large").unlink()
-    (folder / "link").symlink_to("/etc/passwd")
-    assert packed(folder) is None
-    assert packed(tmp_path / "none") is None
 
 
 # --- the page's data ---
@@ -339,8 +323,7 @@ def test_board_data(board):
     assert (data["protocol"], data["made"]) == (1, "2026-01-01")
     assert [e["id"] for e in data["environments"]] == list(module.TASKS)
     found = data["environments"][0]
-    assert found["known"]["best"] == known_returns(ENV).best and found["title"] and found["picture"]["shapes"]
-    assert found["dt"] == 0.02 and "upright" in found["goal"]
+    assert found["known"]["best"] == known_returns(ENV).best and "upright" in found["goal"]
     first, second = found["rows"]
     assert (first["id"], first["rank"], second["rank"]) == (best, 1, 2)
     assert first["score"] == pytest.approx(0.9, abs=0.01) and first["interval"][0] <= first["score"]
@@ -436,11 +419,6 @@ def test_coarse_value_functions():
     best = max(range(theta["n"]), key=lambda i: value["values"][i][theta_dot["n"] // 2])
     assert best == theta["n"] // 2  # upright
     assert coarse(incline.Brake.id, None)["axes"][1]["label"] == "x_dot"
-
-
-def test_a_board_that_does_not_exist(board):
-    with pytest.raises(BoardError, match=r"there is no board in .*add FOLDER --board .* begins one there"):
-        board.read()
 
 
 def test_an_empty_board(board):

@@ -21,13 +21,10 @@ from lag_envs.leaderboard.log import fold, parse
 from lag_envs.leaderboard.standings import board_data
 
 
-@pytest.fixture(autouse=True)
-def fakes(monkeypatch):
-    fake_submissions.install(monkeypatch.setattr)
-
-
 @pytest.fixture
-def board(tmp_path):
+def board(tmp_path, monkeypatch):
+    """A board for fake submissions."""
+    fake_submissions.install(monkeypatch.setattr)
     return Board(tmp_path / "board")
 
 

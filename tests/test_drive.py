@@ -132,24 +132,19 @@ def test_the_pages_step_has_pythons_bits_on_users_tasks_too(browsing, bare, kind
 def test_all_bits_in_a_hundred_episodes(browsing, alone, id):
     task = TASKS[id]()
     page = browsing.open(f"{alone.as_uri()}/{id}.html", alone.as_uri())
-    check_bits(
-        page,
-        alone,
-        task,
-        id,
-        [(2**40 + i, at_random(task, i) if i % 2 else by_agent(task)) for i in range(100)],
-    )
+    episodes = [(2**40 + i, at_random(task, i) if i % 2 else by_agent(task)) for i in range(100)]
+    check_bits(page, alone, task, id, episodes)
 
 
 # --- a person at the page -----------------------------------------------------------------------------------
 
 
 def message(page):
-    return page.evaluate("document.querySelector('.message').textContent")
+    return page.text_content(".message")
 
 
 def verdict(page):
-    return page.evaluate("document.querySelector('.verdict').textContent")
+    return page.text_content(".verdict")
 
 
 def reading(page, name):
@@ -191,9 +186,8 @@ def link_of(page):
 def test_by_keys_alone(drive, capsys):
     """Tab, arrows, Space, R and N; the command confirms the drive."""
     page = drive(incline.Tilt.id, hash="#seed=12")
-    assert "← → rate of the tilt φ\u0307 [rad/s]" in message(page) and "Space or a tap starts" in message(
-        page
-    )
+    told = message(page)
+    assert "← → rate of the tilt φ\u0307 [rad/s]" in told and "Space or a tap starts" in told
     page.focus("main")
     for _ in range(40):
         page.keyboard.press("Tab")
@@ -313,7 +307,7 @@ def test_while_watching_the_keys_are_said_to_be_silent(drive, link):
     assert message(page).startswith("Watching the link's drive: you do not steer")
     assert page.evaluate("document.activeElement.className") == "stage"
     until(page, "document.querySelector('.message').textContent.includes('R: drive from this start')")
-    assert page.evaluate("document.querySelector('.go').textContent") == "Start again"
+    assert page.text_content(".go") == "Start again"
     page.click(".go")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
     assert message(page) == ""
@@ -350,7 +344,7 @@ def test_another_link_or_seed_may_follow_a_link(drive, link):
     page.click(".rerun")
     page.evaluate("location.hash = '#seed=9'")
     until(page, "document.querySelector('.message').textContent.includes('starts')")
-    assert page.evaluate("document.querySelector('.go').textContent") == "Start"
+    assert page.text_content(".go") == "Start"
     page.focus(".stage")
     page.keyboard.press("r")
     page.wait_for_timeout(300)
@@ -410,10 +404,7 @@ def test_by_pointer_and_by_touch(drive, browsing):
     middle = box[1] + box[3] / 2
     page.mouse.move(box[0] + 0.98 * box[2], middle)
     page.mouse.down()
-    until(
-        page,
-        "document.querySelector('.driver .readout') && document.querySelector('.go').textContent === 'Pause'",
-    )
+    until(page, "document.querySelector('.go').textContent === 'Pause'")
     shows(page, "φ\u0307", "0.300 rad/s")
     page.mouse.move(box[0] + 0.29 * box[2], middle)
     shows(page, "φ\u0307", "−0.150 rad/s")
@@ -440,10 +431,10 @@ def test_by_pointer_and_by_touch(drive, browsing):
         touch("touchMove", (0, 0.5), down=down)
     touch("touchEnd")
     until(page, f"scrollY < {before - 50}")
-    assert page.evaluate("document.querySelector('.go').textContent") == "Resume"
+    assert page.text_content(".go") == "Resume"
     page.evaluate("document.querySelector('.stage').scrollIntoView({ behavior: 'instant' })")
     touch("touchStart", (0, 0.5))
-    assert page.evaluate("document.querySelector('.go').textContent") == "Resume"
+    assert page.text_content(".go") == "Resume"
     touch("touchEnd")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
     # The first finger steers, whatever the second does.
@@ -477,7 +468,7 @@ def test_a_gamepad_drives_and_may_leave(drive):
     shows(page, "φ\u0307", "0.150 rad/s")
     page.evaluate("window.pad.connected = false")
     until(page, "document.querySelector('.message').textContent.startsWith('The gamepad is disconnected')")
-    assert page.evaluate("document.querySelector('.go').textContent") == "Resume"
+    assert page.text_content(".go") == "Resume"
     page.focus(".stage")
     page.keyboard.press("Space")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
@@ -514,15 +505,11 @@ def test_a_gamepad_is_enough(drive):
 def test_a_changed_machine_is_not_scored(drive):
     page = drive("PivotedBar-v0")
     page.click(".sliders summary")
-    names = page.evaluate("[...document.querySelectorAll('.sliders label span')].map((e) => e.textContent)")
+    names = page.locator(".sliders label span").all_text_contents()
     assert names == ["mass", "centre-of-mass distance", "damping", "gravity", "track", "control limit"]
     before = page.evaluate("document.querySelector('.driver .scene').toDataURL()")
-    outputs = page.evaluate("[...document.querySelectorAll('.sliders output')].map((e) => e.textContent)")
-    assert outputs[-1] == "5 m/s²"
-    page.evaluate(
-        "(() => { const i = document.querySelectorAll('.sliders input')[1]; i.value = '1';"
-        "i.dispatchEvent(new Event('input')); })()"
-    )
+    assert page.locator(".sliders output").last.text_content() == "5 m/s²"
+    page.fill(".sliders input >> nth=1", "1")
     assert "not scored" in message(page)
     assert page.evaluate("document.querySelector('.driver .scene').toDataURL()") != before
     page.focus(".stage")
@@ -586,10 +573,8 @@ def test_what_the_browser_lacks_is_told(browsing, bare):
     page = browsing.open(f"{bare.as_uri()}/PivotedBar-v0.html", bare.as_uri())
     page.evaluate("delete window.CanvasRenderingContext2D")
     page.click(".begin")
-    until(
-        page,
-        "document.querySelector('#drive .status').textContent.includes('lacks what driving needs: drawing')",
-    )
+    status = "document.querySelector('#drive .status').textContent"
+    until(page, f"{status}.includes('lacks what driving needs: drawing')")
     assert not page.evaluate("document.querySelector('.begin').disabled")
 
 

@@ -1,5 +1,6 @@
 """Trained models and our own agents become submissions that act alike."""
 
+import argparse
 import json
 import shutil
 
@@ -10,6 +11,7 @@ from small_submissions import ABOUT, ENV, network
 
 from agents import measure
 from lag_envs import sb3_policies
+from lag_envs.errors import UserError
 from lag_envs.leaderboard import export
 from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.leaderboard.submission import load, write
@@ -73,19 +75,17 @@ def model(algo, seed=0, bins=0, frames=0, normalise=False, env_id=ENV, **options
     ],
 )
 def test_export_acts_as_the_model(algo, options, tmp_path):
-    from lag_envs.leaderboard.export import Source, algorithm_of, convert, difference
-
     made, normalise = model(algo, **options)
     made.save(tmp_path / "model.zip")
     # A policy of our own does not tell what it was trained by; its training's result does.
     result = {"algo": algo.lower()} if "kind" in options else None
-    found = algorithm_of(Source(tmp_path / "model.zip", result=result))
+    found = export.algorithm_of(export.Source(tmp_path / "model.zip", result=result))
     assert found == {"DDPG": "td3"}.get(algo, algo.lower())
     frames = options.get("frames", 1)
-    table, arrays = convert(made, TASKS[ENV](), normalise, frames)
+    table, arrays = export.convert(made, TASKS[ENV](), normalise, frames)
     agent = network(tmp_path / "a", table, arrays).policies[0][1].agent()
     policy = ModelPolicy(made, TASKS[ENV](), normalise, frames)
-    off, count = difference(policy, agent, ENV)
+    off, count = export.difference(policy, agent, ENV)
     assert off <= 1e-5 and count == 16_384
     if algo == "SAC" and "use_sde" in options:
         assert table["mean_limit"] == 2.0
@@ -93,24 +93,22 @@ def test_export_acts_as_the_model(algo, options, tmp_path):
     # A change that can be felt is noticed.
     arrays["weight_0"] = -arrays["weight_0"]
     agent = network(tmp_path / "b", table, arrays).policies[0][1].agent()
-    assert difference(policy, agent, ENV)[0] > 1e-3
+    assert export.difference(policy, agent, ENV)[0] > 1e-3
 
 
 @pytest.mark.parametrize("algo", ["PPO", "DQN"])
 def test_export_of_a_model_that_chooses_what_the_environment_lists(algo, tmp_path, monkeypatch):
-    from lag_envs.leaderboard.export import convert, difference
-
     env = next(env_id for env_id, task in TASKS.items() if len(task().formulas.choices) == 1)
     monkeypatch.setattr(TASKS[env], "goal", Goal("success: none is asked for", hold=None))  # gives it a board
     made, _ = model(algo, env_id=env, policy_kwargs={"net_arch": [8]})
-    table, arrays = convert(made, TASKS[env]())
+    table, arrays = export.convert(made, TASKS[env]())
     assert not {"bins", "squash"} & set(table)
     agent = network(tmp_path / "a", table, arrays, env=env).policies[0][1].agent()
     policy = ModelPolicy(made, TASKS[env]())
-    assert difference(policy, agent, env) == (0.0, 16_384)
+    assert export.difference(policy, agent, env) == (0.0, 16_384)
     arrays["weight_0"] = -arrays["weight_0"]
     agent = network(tmp_path / "b", table, arrays, env=env).policies[0][1].agent()
-    assert difference(policy, agent, env)[0] == 1.0
+    assert export.difference(policy, agent, env)[0] == 1.0
 
 
 @pytest.fixture(scope="module")
@@ -132,13 +130,9 @@ def runs(tmp_path_factory):
 
 
 def export_command(*arguments):
-    import argparse
-
-    from lag_envs.leaderboard.export import declare_export, run_export
-
     parser = argparse.ArgumentParser()
-    declare_export(parser)
-    return run_export(parser.parse_args([str(a) for a in arguments]))
+    export.declare_export(parser)
+    return export.run_export(parser.parse_args([str(a) for a in arguments]))
 
 
 def test_command_exports_the_runs_of_a_folder(runs, tmp_path, monkeypatch, capsys):
@@ -157,14 +151,19 @@ def test_command_exports_the_runs_of_a_folder(runs, tmp_path, monkeypatch, capsy
         assert measured.tobytes() == policy.agent().predict(seen)[0].tobytes()
 
 
+def network_file(folder):
+    """Write a network of our own."""
+    file = folder / "model.zip"
+    with file.open("wb") as there:
+        np.savez(there, choices=False, weight_0=np.zeros((1, 4)), bias_0=np.zeros(1))
+    return file
+
+
 @pytest.mark.parametrize(
     ("algo", "name"), [("fast_ppo", "fast PPO"), ("cloning", "cloning"), ("shac", "SHAC"), (None, "PPO")]
 )
 def test_networks_of_our_own_are_called_by_their_learners(algo, name, tmp_path):
-    file = tmp_path / "model.zip"
-    with open(file, "wb") as there:
-        np.savez(there, choices=False, weight_0=np.zeros((1, 4)), bias_0=np.zeros(1))
-    source = export.Source(file, result={"algo": algo} if algo else None)
+    source = export.Source(network_file(tmp_path), result={"algo": algo} if algo else None)
     assert export._name(source, None) == name
     with pytest.raises(export.ExportError, match="--algo is for models of Stable-Baselines3"):
         export.exported(source, ENV, "sac")
@@ -172,19 +171,12 @@ def test_networks_of_our_own_are_called_by_their_learners(algo, name, tmp_path):
 
 @pytest.mark.parametrize(("option", "value"), [("frames", 4), ("algo", "sac"), ("normalise", "norm.pkl")])
 def test_options_for_models_are_refused_for_networks(option, value, tmp_path):
-    from lag_envs.errors import UserError
-
-    file = tmp_path / "model.zip"
-    with open(file, "wb") as there:
-        np.savez(there, choices=False, weight_0=np.zeros((1, 4)), bias_0=np.zeros(1))
-    given = [file, "--author", "A", "--license", "MIT", "--env", ENV, "--name", "x", "--seconds", 1]
+    given = ["--author", "A", "--license", "MIT", "--env", ENV, "--name", "x", "--seconds", 1]
     with pytest.raises(UserError, match=f"--{option} is for models of Stable-Baselines3; .* holds a network"):
-        export_command(*given, f"--{option}", value)
+        export_command(network_file(tmp_path), *given, f"--{option}", value)
 
 
 def test_command_exports_files(runs, tmp_path):
-    from lag_envs.errors import UserError
-
     files = [runs / f"seed{s}" / "model.zip" for s in range(5)]
     norms = [file.with_name("vecnormalize.pkl") for file in files]
     given = [*files, "--author", "A", "--license", "MIT", "--output", tmp_path / "out"]
@@ -209,27 +201,26 @@ def test_command_exports_files(runs, tmp_path):
 
 def test_models_that_cannot_be_exported(runs, tmp_path):
     torch = pytest.importorskip("torch")
-    from lag_envs.leaderboard.export import ExportError, Source, convert, export, find
-
     made, _ = model("PPO", policy_kwargs={"activation_fn": torch.nn.Hardswish})
-    with pytest.raises(ExportError, match="all activations must be one of"):
-        convert(made, TASKS[ENV]())
+    with pytest.raises(export.ExportError, match="all activations must be one of"):
+        export.convert(made, TASKS[ENV]())
     with pytest.raises(
-        ExportError, match=r"sees .* numbers, which do not fit Tilt with .* and 3 frames; --frames"
+        export.ExportError, match=r"sees .* numbers, which do not fit Tilt with .* and 3 frames; --frames"
     ):
-        convert(made, TASKS[ENV](), frames=3)
-    with pytest.raises(ExportError, match="is neither a model nor a folder"):
-        find([tmp_path])
-    (tmp_path / "x.zip").write_bytes(b"no zip")
-    with pytest.raises(ExportError, match="not a model of Stable-Baselines3"):
-        export([Source(tmp_path / "x.zip")], tmp_path / "a", authors=["A"], license="MIT", env=ENV, seconds=1)
-    with pytest.raises(ExportError, match="at least 5 policies"):
-        export(find([runs / "seed0"]), tmp_path / "a", authors=["A"], license="MIT")
+        export.convert(made, TASKS[ENV](), frames=3)
+    with pytest.raises(export.ExportError, match="is neither a model nor a folder"):
+        export.find([tmp_path])
+    source = export.Source(tmp_path / "x.zip")
+    source.model.write_bytes(b"no zip")
+    with pytest.raises(export.ExportError, match="not a model of Stable-Baselines3"):
+        export.export([source], tmp_path / "a", authors=["A"], license="MIT", env=ENV, seconds=1)
+    with pytest.raises(export.ExportError, match="at least 5 policies"):
+        export.export(export.find([runs / "seed0"]), tmp_path / "a", authors=["A"], license="MIT")
     made, _ = model("PPO", policy_kwargs={"net_arch": [7]})
     made.save(tmp_path / "other.zip")
-    sources = [*find([runs / "seed0"]), Source(tmp_path / "other.zip")]
-    with pytest.raises(ExportError, match="networks differ"):
-        export(sources, tmp_path / "a", authors=["A"], license="MIT", seconds=1.0)
+    sources = [*export.find([runs / "seed0"]), export.Source(tmp_path / "other.zip")]
+    with pytest.raises(export.ExportError, match="networks differ"):
+        export.export(sources, tmp_path / "a", authors=["A"], license="MIT", seconds=1.0)
 
 
 # --- our own agents ---

@@ -84,14 +84,7 @@ def test_what_is_refused_is_told_and_costs_the_others_nothing(run):
     write("bad", refuse="policy_0.safetensors: holds NaN")
     status, out, err = run("add", "bad", "good", "none", "--nonce", "n")
     assert status == 1 and "verified" in out
-    assert (
-        err.splitlines()
-        == [
-            "bad: refused: policy_0.safetensors: holds NaN",
-            "none: refused: submission.toml: cannot be read",
-        ]
-        or "none: refused" in err
-    )
+    assert "bad: refused: policy_0.safetensors: holds NaN\n" in err and "none: refused: submission" in err
     assert len(ids()) == 1
 
 
@@ -157,17 +150,11 @@ def test_withdraw(run):
 
 
 def test_mistakes(run):
-    for arguments in (["list"], ["show", "x"], ["--help"], ["add", "--jobs", "0"], []):
-        if arguments in (["list"], ["show", "x"]):
-            status, _, err = run(*arguments)
-            assert (
-                status == 2
-                and "no board in leaderboard; --board names the folder of one, and `lag-envs" in err
-            )
-        else:
-            with pytest.raises(SystemExit) as left:
-                run(*arguments)
-            assert left.value.code == (0 if arguments == ["--help"] else 2)
+    for arguments, status in ((["--help"], 0), (["add", "--jobs", "0"], 2), ([], 2)):
+        with pytest.raises(SystemExit) as left:
+            run(*arguments)
+        assert left.value.code == status
+    assert "there is no board in leaderboard; --board names the folder of one" in run("list")[2]
     Path("torn").mkdir()
     Path("torn", "board.jsonl").write_text('{"event": "prot')
     status, _, err = run("list", "--board", "torn")
@@ -251,7 +238,6 @@ def test_what_does_not_exist_is_told_at_once(run):
     run("add", "a", "--nonce", "n")
     for arguments, told in (
         (("serve", "--port", "99999999"), "--port must be a number from 0 to 65535, got 99999999"),
-        (("list", "--board", "typo"), "there is no board in typo; --board names"),
         (("audit", "--pin", "typo.json"), "--pin: there is no file typo.json"),
     ):
         status, _, err = run(*arguments)
@@ -262,10 +248,8 @@ def test_what_does_not_exist_is_told_at_once(run):
 def test_serve(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")
-    script = (
-        "import fake_submissions; from lag_envs import cli; fake_submissions.install(); raise SystemExit("
-    )
-    script += "cli.main(['leaderboard', 'serve', '--port', '0']))"
+    script = "import fake_submissions; from lag_envs import cli; fake_submissions.install()\n"
+    script += "raise SystemExit(cli.main(['leaderboard', 'serve', '--port', '0']))"
     path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     server = subprocess.Popen(
         [sys.executable, "-c", script],
@@ -302,13 +286,18 @@ def test_generated_parts_are_as_generated():
         )
 
 
+def cells_of(table):
+    """Return the cells of a table in Markdown, by rows."""
+    lines = table.splitlines()
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+
+
 def test_top_of_each_board(run):
     for number in range(4):
         write(f"{number}", f"agent {number}", score=0.2 * number)
     write("other", "x | <b>[y](z)</b>", env=incline.Tilt.id, kind="controller")
     run("add", *range(4), "other", "--nonce", "n")
-    lines = docs.top(board_data(Board("leaderboard"))).splitlines()
-    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    cells = cells_of(docs.top(board_data(Board("leaderboard"))))
     assert [[row[0], *(cell.partition(" 0.")[0] for cell in row[1:])] for row in cells[2:]] == [
         [ENV, "agent 3", "agent 3"],
         [incline.Tilt.id, r"x \| &lt;b&gt;\[y\]\(z\)&lt;/b&gt;", ""],
@@ -329,8 +318,7 @@ def test_agents_over_all_boards(run):
     assert found["Both | *"]["boards"] == 2 and found["Both | *"]["of"] == 2
     assert found["C4"]["score"] == pytest.approx(0.5 * 0.94, abs=0.01)
     assert found["C4"]["there"] == pytest.approx(0.94, abs=0.01)
-    lines = docs.together(data).splitlines()
-    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    cells = cells_of(docs.together(data))
     assert [row[:2] for row in cells[2:]] == [
         ["1", r"Both \| \*"], ["2", "C4"], ["3", "C3"], ["4", "C2"], ["5", "C1"], ["7", "Learner"]
     ]  # fmt: skip

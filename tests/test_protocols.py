@@ -19,13 +19,10 @@ from lag_envs.scores import known_returns
 from lag_envs.tasks import pivoted_bar
 
 
-@pytest.fixture(autouse=True)
-def fakes(monkeypatch):
-    fake_submissions.install(monkeypatch.setattr)
-
-
 @pytest.fixture
-def board(tmp_path):
+def board(tmp_path, monkeypatch):
+    """A board for fake submissions."""
+    fake_submissions.install(monkeypatch.setattr)
     return Board(tmp_path / "board")
 
 
@@ -58,12 +55,17 @@ def test_a_new_protocol_verifies_anew_what_is_there_and_freezes_the_old(board):
     assert states(board) == {old: "superseded", waiting: "verified", gone: "verified", new: "verified"}
 
 
+def without(patch, env_id):
+    """Leave an environment out of the package."""
+    tasks = {name: task for name, task in module.TASKS.items() if name != env_id}
+    for place in (module, protocol, ranking, standings):
+        patch.setattr(place, "TASKS", tasks)
+
+
 def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
     new = pivoted_bar.SwingUpFree.id
-    tasks = {name: task for name, task in module.TASKS.items() if name != new}
     with monkeypatch.context() as before:
-        for place in (module, protocol, standings):
-            before.setattr(place, "TASKS", tasks)
+        without(before, new)
         old = add(board, nonce="1")
         shown = board_data(board, "today")["environments"][0]
     with pytest.raises(BoardError, match="add to a board of protocol 1: success differ"):
@@ -87,10 +89,8 @@ def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
 
 
 def test_boards_join_no_protocol_of_other_rules(board, monkeypatch):
-    tasks = {name: task for name, task in module.TASKS.items() if name != pivoted_bar.SwingUpFree.id}
     with monkeypatch.context() as before:
-        for place in (module, protocol, standings):
-            before.setattr(place, "TASKS", tasks)
+        without(before, pivoted_bar.SwingUpFree.id)
         add(board, nonce="1")
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 7)
     assert board.open() == 2
@@ -163,9 +163,7 @@ def test_the_board_of_an_environment_that_is_gone_is_still_shown(board, monkeypa
     id = add(board, nonce="1")
     other = add(board, env=pivoted_bar.SwingUpFree.id, nonce="2")
     before = board_data(board, "today")["environments"][0]
-    tasks = {name: task for name, task in module.TASKS.items() if name != ENV}
-    for place in (module, ranking, standings):
-        monkeypatch.setattr(place, "TASKS", tasks)
+    without(monkeypatch, ENV)
     real = fake_submissions.about
 
     def about(files):

@@ -25,18 +25,13 @@ def data():
     return board_pages.data()
 
 
-@pytest.fixture(scope="module")
-def hostile():
-    return board_pages.hostile()
-
-
 def unpacked(column, n, unit):
     """Return the numbers of a column."""
     return unit * np.cumsum(np.cumsum(column) if isinstance(column, list) else [column] + [0] * (n - 1))
 
 
-def test_what_comes_from_submissions_is_escaped(hostile):
-    pages, files = render(hostile)
+def test_what_comes_from_submissions_is_escaped():
+    pages, files = render(board_pages.hostile())
     for name, text in (pages | files).items():
         if "/site-" in name:
             continue
@@ -116,7 +111,7 @@ def test_agents_have_pages_and_news_are_fed():
     for part in ("<bdi>iLQR</bdi></h1>", "0.996",
                  "<bdi>see <code>lag-envs list</code> &lt;b&gt;</bdi>", "Ada Example", 'href="https://example.org/code"',
                  f"lag-envs watch {env_id} --agent leaderboard/submissions/{own}",
-                 f'<meta property="og:title" content="iLQR · {env_id}">',
+                 f'<meta property="og:title" content="iLQR · {env_id} · lag_envs leaderboard">',
                  '<meta property="og:description" content="Controller: score 0.996, rank 1">'):  # fmt: skip
         assert part in page, part
     assert len(json.loads(re.findall(r'id="data">(.*?)<', page)[0])["rows"]) == 1
@@ -208,6 +203,12 @@ def test_episodes_are_written_as_columns():
                 values = unpacked(found["poses"]["columns"][c], n, units[i])
                 np.testing.assert_allclose(values, poses[:, frame, i], atol=0.6 * units[i])
         assert len(json.dumps(found)) < 1.4 * len(json.dumps(replay))
+
+
+def test_a_page_shows_the_scene_of_its_environment(data):
+    page = render(data)[0]["PivotedBar-v0.html"]
+    shown = json.loads(re.findall(r'id="data">(.*?)<', page)[0])
+    assert shown["title"] and shown["picture"]["shapes"] and shown["dt"] == 0.02
 
 
 def test_episodes_that_cannot_be_drawn_are_kept():

@@ -37,11 +37,6 @@ def data():
 
 
 @pytest.fixture(scope="module")
-def hostile():
-    return board_pages.hostile()
-
-
-@pytest.fixture(scope="module")
 def folder(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("site")
     write_page(data, out)
@@ -163,10 +158,8 @@ def reading(page, side, name):
 
 def test_overview(open_page, data):
     page = open_page("index")
-    assert page.evaluate("document.querySelectorAll('.card').length") == 3
-    assert page.evaluate("document.querySelectorAll('.card .strip .dot').length") == 3 * len(
-        board_pages.AGENTS
-    )
+    assert page.locator(".card").count() == 3
+    assert page.locator(".card .strip .dot").count() == 3 * len(board_pages.AGENTS)
     for i in range(3):
         assert colours(page, f".card:nth-child({i + 1}) canvas") > 50
     told = page.evaluate("[...document.querySelectorAll('.combined tbody tr')].map((row) => row.innerText)")
@@ -298,17 +291,19 @@ def test_filtering(open_page, data):
 
 def test_intervals_as_pictures(open_page, data):
     page = open_page()
-    place = "document.querySelectorAll('.ranking tbody tr')[4].querySelector('.interval')"
-    low, high = (float(page.evaluate(f"{place}.getAttribute('{end}')").rstrip("%")) for end in ("x1", "x2"))
+
+    def ends():
+        place = ".ranking tbody tr:nth-child(5) .interval"
+        return [float(page.get_attribute(place, end).rstrip("%")) for end in ("x1", "x2")]
+
+    low, high = ends()
     row = data["environments"][0]["rows"][4]
     assert page.evaluate("document.querySelectorAll('.ranking .picture .dot').length") == 10
     width = row["interval"][1] - row["interval"][0]
     assert high - low == pytest.approx(100 * width / 1.1, rel=0.15)
     page.click(".filter [value=near]")
-    wide = float(page.evaluate(f"{place}.getAttribute('x2')").rstrip("%")) - float(
-        page.evaluate(f"{place}.getAttribute('x1')").rstrip("%")
-    )
-    assert wide > 5 * (high - low)
+    near_low, near_high = ends()
+    assert near_high - near_low > 5 * (high - low)
 
 
 def test_player(open_page, data):
@@ -317,7 +312,7 @@ def test_player(open_page, data):
     assert clock(page) == 0.0
     before = page.evaluate("document.querySelector('.scene').toDataURL()")
     page.click(".play")
-    assert page.evaluate("document.querySelector('.play').getAttribute('aria-label')") == "Pause"
+    assert page.get_attribute(".play", "aria-label") == "Pause"
     until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.32")
     # A page that was hidden, or busy, goes on where it was.
     now = clock(page)
@@ -326,15 +321,11 @@ def test_player(open_page, data):
     assert clock(page) < now + 1.0
     page.keyboard.press("Space")  # the button has the focus; the clock goes to the nearest whole step
     stopped = clock(page)
-    assert (
-        0.3 < stopped < 8.0
-        and page.evaluate("document.querySelector('.play').getAttribute('aria-label')") == "Play"
-    )
+    assert 0.3 < stopped < 8.0 and page.get_attribute(".play", "aria-label") == "Play"
     assert page.evaluate("document.querySelector('.scene').toDataURL()") != before
 
     # Scrubbing sets the time, for both.
-    page.evaluate("""(() => { const r = document.querySelector('.scrub input'); r.focus(); r.value = 120;
-        r.dispatchEvent(new Event('input', {bubbles: true})); })()""")
+    page.fill(".scrub input", "120")
     until(page, "document.querySelector('.clock').textContent.startsWith('2.40 ')")
     for side, replay in enumerate((first, second)):
         assert reading(page, side, "Time") == "2.40 s"
@@ -361,8 +352,7 @@ def test_player(open_page, data):
         "[...document.querySelectorAll('.pick[aria-pressed=true]')].map(p => p.ariaLabel)"
     )
     assert pressed == ["Watch Value iteration, 81 nodes as A", "Watch Energy pumping + LQR as B"]
-    page.evaluate("""(() => { const e = document.querySelector('.episode'); e.value = '1';
-        e.dispatchEvent(new Event('change')); })()""")
+    page.select_option(".episode >> nth=0", "1")
     page.evaluate("document.querySelector('.scrub input').focus()")
     page.keyboard.press("End")
     total = f"{rows[0]['replays'][1]['return']:.2f}".replace("-", "−")
@@ -371,8 +361,8 @@ def test_player(open_page, data):
 
 def test_speed_and_loop(open_page):
     page = open_page(incline.Brake.id)
-    page.evaluate("""(() => { const s = document.querySelector('.speed select'); s.value = '4';
-        document.querySelector('.loop input').click(); })()""")
+    page.select_option(".speed select", "4")
+    page.click(".loop")
     page.click(".play")
     until(page, "parseFloat(document.querySelector('.clock').textContent) > 1.5")
     until(page, "parseFloat(document.querySelector('.clock').textContent) < 1.0")
@@ -391,22 +381,17 @@ def test_pictures_of_the_ranking(open_page):
     # The value function and the path over it; another pair of coordinates has none.
     until(page, "document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
     shaded = colours(page, ".phase")
-    page.evaluate("""(() => { const s = document.querySelector('.pair select'); s.value = '1';
-        s.dispatchEvent(new Event('change')); })()""")
+    page.select_option(".pair select", "1")
     until(page, "document.querySelector('.phase').ariaLabel.startsWith('s [m] against ')")
     assert 100 < colours(page, ".phase") < shaded
 
 
-def test_hostile_names_stay_names(open_page, hostile, tmp_path):
-    write_page(hostile, tmp_path)
+def test_hostile_names_stay_names(open_page, tmp_path):
+    write_page(board_pages.hostile(), tmp_path)
     page = open_page(root=tmp_path.as_uri())
-    names = page.evaluate("[...document.querySelectorAll('.ranking .name bdi')].map(e => e.textContent)")
-    wanted = [clean(name) for name in HOSTILE]
-    assert names == wanted
-    assert page.evaluate("[...document.querySelectorAll('.legend bdi')].map(e => e.textContent)") == wanted
-    assert page.evaluate(
-        "[...document.querySelectorAll('.agent')[0].options].map(e => e.text).length"
-    ) == len(HOSTILE)
+    for names in (".ranking .name bdi", ".legend bdi"):
+        assert page.locator(names).all_text_contents() == [clean(name) for name in HOSTILE]
+    assert page.locator(".agent").first.locator("option").count() == len(HOSTILE)
     page.click(".play")
     until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.1")
     page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
@@ -425,8 +410,7 @@ def test_narrow_screen(open_page, scheme):
         page = open_page(name, viewport={"width": 320, "height": 640}, is_mobile=True, color_scheme=scheme)
         assert page.evaluate("document.documentElement.scrollWidth") == 320
     # Cards instead of columns; a list replaces sorting by the column heads.
-    page.evaluate("""(() => { const s = document.querySelector('.order select'); s.value = 'effort';
-        s.dispatchEvent(new Event('change', {bubbles: true})); })()""")
+    page.select_option(".order select", "effort")
     efforts = [float(x.split()[-1]) for x in column(page, "[data-label=Effort]")]
     assert efforts == sorted(efforts)
     for button in (".play", ".step", ".pick"):
@@ -490,6 +474,8 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
 )
 def test_axe_finds_nothing_serious(open_page, served, name, scheme):
     page = open_page(name, root=served, color_scheme=scheme, bypass_csp=True)
+    if page.query_selector(".begin"):
+        page.hover(".begin")  # the pointer changes colours
     assert serious(page) == []
 
 
@@ -502,13 +488,19 @@ def test_landmarks_are_told_apart(open_page, served, name):
     assert Axe().run(page, options=options).response["violations"] == []
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The pages of the repository's board."""
+    out = tmp_path_factory.mktemp("whole")
+    write_page(board_data(Board(Path(__file__).parents[1] / "leaderboard")), out)
+    return out
+
+
 @pytest.mark.slow
-def test_axe_finds_nothing_serious_on_the_whole_board(browser, tmp_path):
+def test_axe_finds_nothing_serious_on_the_whole_board(browser, whole):
     """On every page; for an environment's agents, whose pages are made alike, only on the first one's."""
-    board = Path(__file__).parents[1] / "leaderboard"
-    write_page(board_data(Board(board)), tmp_path)
     pages = {}
-    for file in sorted(tmp_path.glob("*.html")):
+    for file in sorted(whole.glob("*.html")):
         of = next((env_id for env_id in TASKS if file.stem.startswith(f"{env_id}-")), file.stem)
         pages.setdefault((of, file.stem == of), file)
     assert len(pages) > len(TASKS)
@@ -542,11 +534,10 @@ def test_page_is_light_before_anything_is_played(served, browser, name):
 
 
 @pytest.mark.slow
-def test_every_page_of_the_board_is_light_too(browser, tmp_path):
+def test_every_page_of_the_board_is_light_too(browser, whole):
     """The longest episodes, with up to thousands of steps."""
-    write_page(board_data(Board(Path(__file__).parents[1] / "leaderboard")), tmp_path)
     for env_id in TASKS:
-        assert loaded(browser, (tmp_path / f"{env_id}.html").as_uri())[0] < 300_000, env_id
+        assert loaded(browser, (whole / f"{env_id}.html").as_uri())[0] < 300_000, env_id
 
 
 @pytest.mark.slow
@@ -593,9 +584,8 @@ def test_reduced_motion(open_page):
         Element.prototype.scrollIntoView = function (o) { asked.push(o.behavior); }; })()""")
     page.evaluate("document.querySelector(\"tr[data-row='2'] .pick\").click()")
     assert until(page, "window.asked.length && window.asked") == ["auto"]
-    assert (
-        page.evaluate("getComputedStyle(document.querySelector('.legend button')).transitionDuration") == "0s"
-    )
+    style = "getComputedStyle(document.querySelector('.legend button'))"
+    assert page.evaluate(f"{style}.transitionDuration") == "0s"
     assert not page.evaluate("!!document.querySelector('.playing')"), "nothing moves that was not asked to"
 
 

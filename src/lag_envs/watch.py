@@ -151,8 +151,6 @@ def _model(env_id: str, task: Any, path: Path) -> Any:
         model, normalise = export.load_model(source, export.algorithm_of(source))
     except ImportError as error:
         raise UserError(f'{path}: stable-baselines3 is missing: pip install "lag-envs[agents]"') from error
-    except export.ExportError as error:
-        raise UserError(str(error)) from error
     seen, own = model.observation_space.shape, source.frames * len(task.observation)
     if seen != (own,):
         raise UserError(f"{path} observes {seen} numbers, {env_id} has {own}")

@@ -23,11 +23,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar, cast
 
+from lag_envs.errors import UserError
+
 Submit = Callable[..., Future]
 Key = TypeVar("Key")
 
 
-class SpreadError(Exception):
+class SpreadError(UserError):
     """The work cannot be spread; the text says why, and what to do."""
 
 

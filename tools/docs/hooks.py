@@ -79,8 +79,9 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
     for entry in config.nav or ():
         ((title, pages),) = entry.items()
         first = pages[0] if isinstance(pages[0], str) else next(iter(pages[0].values()))
-        sections.append((title, "../" + first.removesuffix("md") + "html"))
-    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections, SOURCE)
+        address = f"{BOARD}/index.html" if title == "Leaderboard" else first.removesuffix("md") + "html"
+        sections.append((title, f"../{address}"))
+    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections, SOURCE, f"../{ENVIRONMENTS}/")
     return {f"{BOARD}/{name}": content for name, content in (pages | files).items()}
 
 

@@ -7,7 +7,6 @@ from importlib import import_module
 from typing import Any
 
 from lag_envs.commands.base import Command, needs
-from lag_envs.errors import UserError
 
 
 def _replay(function: str) -> Callable[..., Any]:
@@ -15,7 +14,7 @@ def _replay(function: str) -> Callable[..., Any]:
 
 
 def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
-    """Return a function of the leaderboard, imported when it is called; its errors become UserErrors."""
+    """Return a function of the leaderboard, imported when it is called."""
 
     def call(given: Any) -> Any:
         needs(
@@ -23,14 +22,7 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
             *("confusable_homoglyphs", "jinja2", "packaging", "pebble", "pydantic", "safetensors", "scipy"),
             *("sympy", "tomli_w", "tqdm"),
         )
-        from lag_envs.leaderboard.board import BoardError
-        from lag_envs.leaderboard.submission import Refused
-        from lag_envs.workers import SpreadError
-
-        try:
-            return getattr(import_module(f"lag_envs.leaderboard.{module}"), function)(given)
-        except (BoardError, Refused, SpreadError) as error:
-            raise UserError(str(error)) from error
+        return getattr(import_module(f"lag_envs.leaderboard.{module}"), function)(given)
 
     return call
 

@@ -39,7 +39,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
 def run_report(args: argparse.Namespace) -> int:
     """Measure errors and write the page."""
     needs("report", "flint", "jinja2", "matplotlib", "mpmath", "scipy", "sympy")
-    from lag_envs.report.report import SECTIONS, NotAReport, ReportSettings, make_report
+    from lag_envs.report.report import SECTIONS, ReportSettings, make_report
 
     file, folder = _places(args.places)
     if file:
@@ -51,30 +51,23 @@ def run_report(args: argparse.Namespace) -> int:
                     f"--{option} is for the report about this package: leave out --{option} or {file}"
                 )
         own.subjects(file)  # errors in the file are reported before anything is measured
-        made = ReportSettings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
-        try:
-            return 0 if make_report(made) else 130
-        except NotAReport as error:
-            raise UserError(str(error)) from error
-    names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
-    for name in names:
-        if name not in SECTIONS:
-            raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
-    if args.docs and (args.quick or names != SECTIONS):
-        raise UserError("--docs needs a whole report: leave out --quick and --sections")
+        names: tuple[str, ...] = (own.SECTION,)
+    else:
+        names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
+        for name in names:
+            if name not in SECTIONS:
+                raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     if args.docs:
+        if args.quick or names != SECTIONS:
+            raise UserError("--docs needs a whole report: leave out --quick and --sections")
         check_checkout("--docs", args.docs)
-    settings = ReportSettings(folder, args.quick, names, args.processes, args.date)
-    try:
-        if not make_report(settings):
-            return 130
-        if args.docs:
-            from lag_envs.report import docs
+    if not make_report(ReportSettings(folder, args.quick, names, args.processes, args.date, file)):
+        return 130
+    if args.docs:
+        from lag_envs.report import docs
 
-            return docs.main([folder, args.docs])
-        return 0
-    except NotAReport as error:
-        raise UserError(str(error)) from error
+        return docs.main([folder, args.docs])
+    return 0
 
 
 def _places(places: Sequence[str]) -> tuple[str, str]:

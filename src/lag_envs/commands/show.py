@@ -150,8 +150,8 @@ WATCH = Command(
     "watch",
     "watch an agent, in a window or as a video",
     """Watch an agent drive an environment, in a window, or write a video. By default it is the policy
-that comes with the package, the best on the leaderboard; controllers are chosen by name. It needs the
-extras render and leaderboard; models of your own need agents too.
+that comes with the package, the best network or table of the leaderboard; controllers are chosen by
+name. It needs the extras render and leaderboard; models of your own need agents too.
 
 examples:
   lag-envs watch PivotedBar-v0

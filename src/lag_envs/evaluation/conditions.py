@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.imperfections import MOST_DRAWN
@@ -75,8 +75,7 @@ def disturbances(env_id: str) -> list[Condition]:
 
 def _positive(env_id: str) -> dict[str, float]:
     """Return the environment's positive, finite numbers."""
-    scene = TASKS[env_id]().scene
-    values = {f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)}
+    values = parameter_values(TASKS[env_id]().scene)
     return {k: x for k, x in values.items() if isinstance(x, float) and 0.0 < x < math.inf}
 
 

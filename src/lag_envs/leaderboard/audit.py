@@ -20,6 +20,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,7 +54,7 @@ from lag_envs.leaderboard.results import apart, code_digest, compare_results
 from lag_envs.store import write_file
 
 if TYPE_CHECKING:
-    from lag_envs.leaderboard.submission import About
+    from lag_envs.leaderboard.submission import About, Submission
 
 #: The release's record of the repository's board.
 PIN = Path(__file__).with_name("pin.json")
@@ -348,7 +349,8 @@ def _history(board: Board, log: bytes) -> Finding:
             if b'"prev"' not in then:
                 before += 1  # a board that was begun again, before there was a chain
                 continue
-            odd = next(i for i, (a, b) in enumerate(_pairs(then, log), 1) if a != b)
+            pairs = zip_longest(then.split(b"\n")[:-1], log.split(b"\n")[:-1])
+            odd = next(i for i, (a, b) in enumerate(pairs, 1) if a != b)
             found.wrong.append(
                 f"{board.log}, line {odd} is not what it was in commit {commit[:10]}: a log only"
                 f" ever grows; `git checkout {commit[:10]} -- {board.log}` restores it"
@@ -361,12 +363,6 @@ def _history(board: Board, log: bytes) -> Finding:
     except NoHistory as error:
         found.open = str(error)
     return found
-
-
-def _pairs(then: bytes, now: bytes) -> Iterator[tuple[bytes | None, bytes | None]]:
-    a, b = then.split(b"\n")[:-1], now.split(b"\n")[:-1]
-    for i in range(max(len(a), len(b))):
-        yield (a[i] if i < len(a) else None), (b[i] if i < len(b) else None)
 
 
 def head_of(board: Board) -> str:
@@ -479,26 +475,29 @@ def audit(
     return not any(finding.wrong for finding in findings)
 
 
-def _playable(board: Board, found: CheapChecks) -> Iterator[tuple[BoardEntry, dict[str, Any], float, str]]:
-    """Yield all that can be verified again: entry, result, best return minus random, place for messages."""
+def _playable(
+    board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]
+) -> Iterator[tuple[BoardEntry, Submission, dict[str, Any], float, str]]:
+    """Yield all that can be verified again.
+
+    Each has an entry, its submission, its result, the best return minus random, and a place for messages.
+    """
+    from lag_envs.leaderboard.submission import Refused, load
+
     for (number, id), result in found.results.items():
         entry = found.state.boards[number][id]
         told = found.state.protocols.get(number)
         scale = told.scales.get(entry.env) if told else None
         if told is None or scale is None or told.rules.model_dump() != protocol.rules():
             continue
-        where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
-        yield entry, result, scale.best - scale.random, where
-
-
-def _load(board: Board, entry: BoardEntry) -> Any:
-    from lag_envs.leaderboard.submission import Refused, load
-
-    try:
-        submission = load(board.submission(entry.id))
-    except Refused:
-        return None
-    return submission if submission.digest == entry.digest else None  # otherwise already reported
+        progress(entry)
+        try:
+            submission = load(board.submission(entry.id))
+        except Refused:
+            continue
+        if submission.digest == entry.digest:  # otherwise already reported
+            where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
+            yield entry, submission, result, scale.best - scale.random, where
 
 
 def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
@@ -508,10 +507,7 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
     from lag_envs.leaderboard.verify import record_again
 
     finding, draw, played, results = Finding("scores"), random.SystemRandom(), 0, 0
-    for entry, result, way, where in _playable(board, found):
-        progress(entry)
-        if (submission := _load(board, entry)) is None:
-            continue
+    for entry, submission, result, way, where in _playable(board, found, progress):
         middle, recorded = shown_episodes(result)
         odd: list[str] = []
         # On another build, one of these few episodes may be a different one altogether.
@@ -570,10 +566,7 @@ def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]
     from lag_envs.leaderboard.verify import verify
 
     finding, same, bits = Finding("scores"), 0, 0
-    for entry, result, way, where in _playable(board, found):
-        progress(entry)
-        if (submission := _load(board, entry)) is None:
-            continue
+    for entry, submission, result, way, where in _playable(board, found, progress):
         try:
             again = verify(submission, entry.nonce, result["episodes"])
             compared = compare_results(result, again, way, submission.architecture.plans)

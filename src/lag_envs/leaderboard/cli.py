@@ -7,7 +7,8 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +144,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
 
 
 def run_leaderboard(args: argparse.Namespace) -> int:
-    """Run the requested action; raise a BoardError or SpreadError if it fails."""
+    """Run the requested action; raise a UserError if it fails."""
     try:
         return args.act(args)
     except KeyboardInterrupt:
@@ -242,27 +243,15 @@ def _finish(board: Board, args: argparse.Namespace) -> int:
     def tell(entry: BoardEntry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
 
-    def parallel_map(check: PendingCheck, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
+    def parallel_map(check: PendingCheck, folders: Sequence[Path]) -> Iterable[tuple[Path, Any]]:
         from tqdm import tqdm
 
-        from lag_envs.leaderboard.parallel import map_submissions
+        from lag_envs.leaderboard.parallel import map_submissions, with_bar
 
-        jobs = min(args.jobs, len(folders))
-        if args.ray is not None or jobs > 1:
-            found = map_submissions(check, folders, jobs, args.ray)
-            yield from tqdm(found, "verifying", len(folders), disable=None, leave=False)
-            return
-
-        def one(folder: Path) -> dict[str, Any]:
-            with tqdm(desc=folder.name, unit=" steps", unit_scale=True, disable=None, leave=False) as bar:
-
-                def progress(done: int, total: int) -> None:
-                    bar.total = total
-                    bar.update(done - bar.n)
-
-                return check(folder, progress)
-
-        yield from map_submissions(one, folders)
+        if args.ray is None and min(args.jobs, len(folders)) <= 1:
+            return map_submissions(partial(with_bar, check), folders)
+        found = map_submissions(check, folders, args.jobs, args.ray)
+        return tqdm(found, "verifying", len(folders), disable=None, leave=False)
 
     return finish(board, parallel_map=parallel_map, tell=tell)
 
@@ -443,7 +432,6 @@ def _build(args: argparse.Namespace) -> int:
 
 def _serve(args: argparse.Namespace) -> int:
     """Serve to this machine only, until Ctrl-C."""
-    from functools import partial
     from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
     from lag_envs.leaderboard.site.build import write_page

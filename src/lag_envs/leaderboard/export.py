@@ -46,7 +46,7 @@ DIFFERENCE = 1e-5
 MODEL, NORMALISATION, RESULT = "model.zip", "vecnormalize.pkl", "result.json"
 
 
-class ExportError(Exception):
+class ExportError(UserError):
     """A model that cannot be exported; the text says why."""
 
 
@@ -305,23 +305,19 @@ def difference(policy: ModelPolicy, agent: Any, env_id: str) -> tuple[float, int
     worth = agent.layers.outputs(agent.layers.normalised(both.astype(np.float64)))
     model_action, action = policy.actions(both)[0], agent.predict(frames[:, -1], before)[0]
     if choices:
-        return _lost(worth, model_action, choices), len(both)
+        lists = np.split(worth, np.cumsum(choices)[:-1], axis=1)
+        chosen = zip(lists, model_action.reshape(len(both), -1).T, strict=True)
+        return float(not all(_as_good(*each).all() for each in chosen)), len(both)
     off = np.abs(model_action.astype(np.float64) - action).max(axis=1)
     if policy.centres is not None:
-        chosen = np.abs(policy.centres - model_action).argmin(axis=1)
-        lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
-        off[lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))] = 0.0
+        off[_as_good(worth, np.abs(policy.centres - model_action).argmin(axis=1))] = 0.0
     return float(off.max()), len(both)
 
 
-def _lost(worth: NDArray, chosen: NDArray, choices: Sequence[int]) -> float:
-    """Return 1 where something is chosen that is worth less, by more than float32 rounds, else 0."""
-    parts = np.split(worth, np.cumsum(choices)[:-1], axis=1)
-    for each, index in zip(parts, chosen.reshape(len(worth), -1).T, strict=True):
-        lost = each.max(axis=1) - each[np.arange(len(each)), index]
-        if (lost > 1e-5 * np.maximum(1.0, np.abs(each).max(axis=1))).any():
-            return 1.0
-    return 0.0
+def _as_good(worth: NDArray, chosen: NDArray) -> NDArray[np.bool_]:
+    """Return in which rows the chosen one is worth as much as the best, to float32's rounding."""
+    lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
+    return lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))
 
 
 @dataclass
@@ -547,8 +543,6 @@ def run_export(args: argparse.Namespace) -> int:
         )  # fmt: skip
     except ImportError as error:
         raise UserError(f'{error.name} is missing: pip install "lag-envs[agents,leaderboard]"') from error
-    except ExportError as error:
-        raise UserError(str(error)) from error
     alike = f"largest difference of an action from the models': {off:.1e}, over {count} observations of each"
     print(
         f"{submission.folder}: {submission.env}, {submission.name}, {len(submission.policies)} policies\n"

@@ -1,11 +1,21 @@
-"""Read untrusted files: only plain ones, and only up to a size."""
+"""Digests of files, and reading untrusted ones: only plain ones, and only up to a size."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
+
+
+def digest_of(files: Mapping[str, bytes]) -> str:
+    """Return the SHA-256 of files' names and contents."""
+    total = hashlib.sha256()
+    for name in sorted(files):
+        total.update(f"{name}\n{len(files[name])}\n".encode() + files[name])
+    return total.hexdigest()
 
 
 def read_plain(path: Path, most: int) -> bytes:

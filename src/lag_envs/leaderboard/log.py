@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
+from lag_envs.errors import UserError
 from lag_envs.leaderboard import fields
 from lag_envs.leaderboard.fields import Strict, between, checked, shown_ascii
 from lag_envs.leaderboard.files import read_plain
@@ -35,7 +36,7 @@ REMEDY = "restore it from version control"
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
 
 
-class BoardError(Exception):
+class BoardError(UserError):
     """A request that the board cannot fulfil; the text says why, and what to do."""
 
 
@@ -566,7 +567,7 @@ def read_all(file: int) -> bytes:
     return b"".join(parts)
 
 
-def write_event(log: int, told: dict[str, Any]) -> LogLine:
+def write_event(log: int, told: dict[str, Any]) -> None:
     """Append an event as a line and flush it to the disk, all or nothing.
 
     Raises
@@ -582,7 +583,7 @@ def write_event(log: int, told: dict[str, Any]) -> LogLine:
     line = b"\n" if content and not content.endswith(b"\n") else b""
     told = told | {"prev": hashlib.sha256(content + line).hexdigest()}
     try:
-        event = checked(_EVENTS, told)
+        checked(_EVENTS, told)
     except ValueError as error:
         raise BoardError(f"this cannot be logged: {error}") from None
     line += json.dumps(told, ensure_ascii=False).encode() + b"\n"
@@ -593,4 +594,3 @@ def write_event(log: int, told: dict[str, Any]) -> LogLine:
         os.ftruncate(log, len(content))
         raise
     os.fsync(log)
-    return LogLine((content + line).count(b"\n"), event)

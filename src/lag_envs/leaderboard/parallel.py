@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import stat
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lag_envs.leaderboard.protocol import FOLDER_BYTES
+from lag_envs.leaderboard.fields import ascii_text
 from lag_envs.workers import as_they_finish, cluster, processes
 
 Work = Callable[[Path], Any]
@@ -45,11 +43,14 @@ def map_submissions(
         From `lag_envs.workers`, if Ray or its cluster is missing.
     """
     if ray is not None:
+        from lag_envs.leaderboard.submission import Refused, read_files
+
         with cluster(ray) as submit:
             futures = {}
             for folder in folders:
-                files = packed(folder)
-                if files is None:  # it will be refused, which needs no other machine
+                try:
+                    files = read_files(folder)
+                except Refused:  # the function will find so too, which needs no other machine
                     yield folder, _caught(function, folder)
                 else:
                     futures[submit(_unpacked, function, folder.name, files)] = folder
@@ -62,27 +63,26 @@ def map_submissions(
             yield folder, _caught(function, folder)
 
 
+def with_bar(function: Callable[..., Any], folder: Path) -> Any:
+    """Call a function of a folder and of its progress, which a bar shows on a terminal."""
+    from tqdm import tqdm
+
+    with tqdm(
+        desc=ascii_text(folder.name), unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5
+    ) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return function(folder, progress=show)
+
+
 def _caught(function: Work, folder: Path) -> Any:
     try:
         return function(folder)
     except Exception as error:
         return error
-
-
-def packed(folder: Path) -> dict[str, bytes] | None:
-    """Return a folder's files by name; None unless they are plain files within the size limit."""
-    files: dict[str, bytes] = {}
-    try:
-        with os.scandir(folder) as found:
-            entries = list(found)
-        sizes = [entry.stat(follow_symlinks=False) for entry in entries]
-        if not all(stat.S_ISREG(s.st_mode) for s in sizes) or sum(s.st_size for s in sizes) > FOLDER_BYTES:
-            return None
-        for entry in entries:
-            files[entry.name] = Path(entry.path).read_bytes()
-    except OSError:
-        return None
-    return files
 
 
 def _unpacked(function: Work, name: str, files: dict[str, bytes]) -> Any:

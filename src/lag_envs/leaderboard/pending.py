@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -87,8 +87,7 @@ def shown_episodes(result: Mapping[str, Any]) -> tuple[int, dict[str, int]]:
 
 def finish(
     board: Board,
-    only: Sequence[str] | None = None,
-    parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
+    parallel_map: Callable[..., Iterable[tuple[Path, Any]]] | None = None,
     tell: Callable[[BoardEntry, str], Any] = lambda entry, what: None,
 ) -> int:
     """Verify all pending submissions that have a nonce.
@@ -97,8 +96,6 @@ def finish(
     ----------
     board : Board
         The board.
-    only : sequence of str, optional
-        Ids that may be verified; all by default.
     parallel_map : callable, optional
         Like `map_submissions` with all but its first two arguments given; one after the other by default.
     tell : callable
@@ -119,8 +116,6 @@ def finish(
     with ExitStack() as claims:
         claimed_here: dict[str, tuple[BoardEntry, str]] = {}
         for entry in state.waiting():
-            if only is not None and entry.id not in only:
-                continue
             if reason := closed(entry.env, entry.protocol, state.number):
                 board.rejected(entry.id, f"its board closed before it was verified: {reason}")
             elif not claims.enter_context(board.claimed(entry.id)):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any, NamedTuple
 
+from lag_envs.errors import UserError
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured_entry
 
@@ -29,7 +30,7 @@ PLANNED = 1e-2
 APART = 0.01
 
 
-class Refused(Exception):
+class Refused(UserError):
     """A submission was refused; the text says why, and is safe to print."""
 
 

@@ -13,7 +13,7 @@ bootstrap intervals of 95 %:
   resampled. The interval says how well the mean is known, and nothing about training.
 - The reference that measures luck has a mean that is itself uncertain. Each bootstrap sample therefore draws
   another mean from a normal distribution. The same one is used for all rows, since an error moves them all
-  together, each as far as it was corrected (`luck`). The reference's own row is moved all the way: after
+  together, each as far as it was corrected (`luck_of`). The reference's own row is moved all the way: after
   the correction, nothing is left of it but that mean, of other episodes, with its standard error.
 
 Each row's generator is seeded by its id, so a row's numbers do not depend on the other rows.
@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from lag_envs.evaluation.statistics import (
     RESAMPLES,
     THRESHOLDS,
-    Luck,
     ends,
     improvement,
     iqm,
@@ -97,13 +96,6 @@ class Place(NamedTuple):
     above: Chance | None
 
 
-def luck(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Luck:
-    """Return how policies' returns follow the reference's in the same episodes; no luck without one."""
-    if reference is None or any(p.get("reference") is None for p in policies):
-        return Luck()
-    return luck_of([p["returns"] for p in policies], [p["reference"] for p in policies], reference.mean)
-
-
 def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Array:
     """Return verified policies' returns without the luck of their episodes, shape (policies, episodes).
 
@@ -120,11 +112,18 @@ def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]
     policies : sequence of mapping
         The verified data of each policy: ``returns`` and, if the environment has one, ``reference``.
     """
+    return _corrected(reference, policies)[0]
+
+
+def _corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> tuple[Array, float]:
+    """Return `corrected`, and the standard error that the correction brings into all of it."""
     returns = np.array([p["returns"] for p in policies], np.float64)
-    slope = luck(reference, policies).slope
-    if reference is None or not slope:
-        return returns
-    return returns - slope * (np.array([p["reference"] for p in policies], np.float64) - reference.mean)
+    if reference is None or any(p.get("reference") is None for p in policies):
+        return returns, 0.0
+    others = np.array([p["reference"] for p in policies], np.float64)
+    luck = luck_of(returns, others, reference.mean)
+    error = math.hypot(luck.slope * reference.error, luck.error)
+    return returns - luck.slope * (others - reference.mean), error
 
 
 class Scores(NamedTuple):
@@ -149,14 +148,8 @@ class Scores(NamedTuple):
 
 def scored(scale: Scale, reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Scores:
     """Return the scores of verified policies, see `corrected`."""
-    error = common_error(reference, policies) / abs(scale.best - scale.random)
-    return Scores(normalised(scale, corrected(reference, policies)), error)
-
-
-def common_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float:
-    """Return the standard error that the correction for luck brings into all corrected returns."""
-    found = luck(reference, policies)
-    return 0.0 if reference is None else math.hypot(found.slope * reference.error, found.error)
+    table, error = _corrected(reference, policies)
+    return Scores(normalised(scale, table), error / abs(scale.best - scale.random))
 
 
 def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float | None:
@@ -164,11 +157,11 @@ def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, An
 
     It is None for a single episode, which shows nothing of the spread.
     """
-    table = corrected(reference, policies)
+    table, error = _corrected(reference, policies)
     if table.shape[1] < 2:
         return None
     own = table.std(axis=1, ddof=1).mean() / math.sqrt(table.shape[1])
-    return math.hypot(own, common_error(reference, policies))
+    return math.hypot(own, error)
 
 
 def redrawn(id: str, scores: Scores) -> Array:

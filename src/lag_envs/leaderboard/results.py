@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -15,6 +14,7 @@ from pydantic import Field, TypeAdapter, model_validator
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Strict, ascii_text, checked
+from lag_envs.leaderboard.files import digest_of
 from lag_envs.leaderboard.log import EnvId, Hash, Number, Text, load_json
 
 #: Largest result [bytes], packed and unpacked.
@@ -163,11 +163,9 @@ def checked_value(content: bytes) -> dict[str, Any]:
 @cache
 def code_digest() -> str:
     """Return the SHA-256 of this package's code: another build may give other bits."""
-    root, total = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
-        content = path.read_bytes().replace(b"\r\n", b"\n")
-        total.update(f"{path.relative_to(root).as_posix()}\n{len(content)}\n".encode() + content)
-    return total.hexdigest()
+    root = Path(__file__).parents[1]
+    code = {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*.py")}
+    return digest_of({name: content.replace(b"\r\n", b"\n") for name, content in code.items()})
 
 
 # --- two of the same ----------------------------------------------------------------------------------------

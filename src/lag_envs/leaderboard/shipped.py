@@ -1,4 +1,4 @@
-"""The policies that come with the package: the board's best for each environment, as data.
+"""The policies that come with the package: the board's best network or table for each environment.
 
 ``python -m lag_envs.leaderboard.shipped`` chooses them from a clone's board and writes them beside this file.
 Together they have at most `MOST` bytes; if the best ones are larger, some are replaced by smaller ones, so
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lag_envs.errors import UserError
+from lag_envs.errors import UserError, run_shown
 from lag_envs.options import module_parser
 from lag_envs.store import write_file
 
@@ -149,8 +149,8 @@ def ship(board: Any, folder: Path = FOLDER) -> dict[str, Shipped]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Choose and write the policies."""
-    from lag_envs.leaderboard.board import Board, BoardError
+    """Choose and write the policies; return the exit status, see `run_shown`."""
+    from lag_envs.leaderboard.board import Board
 
     parser = module_parser(
         "lag_envs.leaderboard.shipped",
@@ -160,15 +160,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--board", metavar="FOLDER", type=Path, default=Path("leaderboard"), help="default: leaderboard"
     )
-    try:
-        found = ship(Board(parser.parse_args(arguments).board))
-    except (BoardError, UserError, OSError) as error:
-        print(f"{parser.prog}: error: {error}", file=sys.stderr)
-        return 2
-    for env_id, entry in found.items():
-        size = (FOLDER / f"{env_id}.safetensors").stat().st_size
-        print(f"{env_id}: {entry.name}, seed {entry.seed}, score {entry.score:.4f}, {size:,} bytes")
-    return 0
+    board = Board(parser.parse_args(arguments).board)
+
+    def choose() -> int:
+        for env_id, entry in ship(board).items():
+            size = (FOLDER / f"{env_id}.safetensors").stat().st_size
+            print(f"{env_id}: {entry.name}, seed {entry.seed}, score {entry.score:.4f}, {size:,} bytes")
+        return 0
+
+    return run_shown(parser.prog, choose)
 
 
 if __name__ == "__main__":

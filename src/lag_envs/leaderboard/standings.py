@@ -94,7 +94,6 @@ def _environment(
     from lag_envs.evaluation.statistics import ends, iqm, rounded_data
     from lag_envs.leaderboard import ranking
     from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
-    from lag_envs.leaderboard.site.scenery import scenery_data
 
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
     told = state.protocols.get(number)
@@ -164,7 +163,7 @@ def _environment(
             for e in entries.values()
             if e.state != "verified"
         ],
-    } | scenery_data(env_id)
+    }
 
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:

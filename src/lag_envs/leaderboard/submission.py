@@ -6,7 +6,6 @@ each file of arrays, and only then the arrays. Bad input is refused before more 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -36,7 +35,8 @@ from lag_envs.leaderboard.fields import (
     line,
     shown_ascii,
 )
-from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.files import digest_of, read_plain
+from lag_envs.leaderboard.log import load_json
 from lag_envs.leaderboard.names import wordless
 from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
 from lag_envs.leaderboard.protocol import Refused
@@ -380,14 +380,6 @@ def _check_different(policies: Sequence[tuple[int, SubmittedPolicy]]) -> None:
             )
 
 
-def digest_of(files: Mapping[str, bytes]) -> str:
-    """Return the digest of a submission's files: the SHA-256 of their names and contents."""
-    total = hashlib.sha256()
-    for name in sorted(files):
-        total.update(f"{name}\n{len(files[name])}\n".encode() + files[name])
-    return total.hexdigest()
-
-
 # --- arrays -------------------------------------------------------------------------------------------------
 
 
@@ -416,20 +408,14 @@ def read_arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDAr
 
 def _check_header(content: bytes) -> None:
     """Refuse a header that the library would accept: too long, repeated keys, other types or extra fields."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            raise ValueError("a key occurs twice")
-        return dict(pairs)
-
     size = int.from_bytes(content[:8], "little")
     if len(content) >= 8 and size > protocol.HEADER_BYTES:
         raise ValueError(f"its header must have at most {protocol.HEADER_BYTES} bytes, not {size}")
     if len(content) < 8 + size:
         raise ValueError(f"it is cut off after {len(content)} bytes")
     try:
-        header = json.loads(content[8 : 8 + size].decode(), object_pairs_hook=once)
-    except (ValueError, RecursionError) as error:
+        header = load_json(content[8 : 8 + size])
+    except ValueError as error:
         raise ValueError(f"its header is not JSON ({error})") from error
     for key, entry in header.items() if isinstance(header, dict) else ():
         if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:

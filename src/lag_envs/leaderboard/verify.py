@@ -352,32 +352,12 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
 
 def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
     """Verify here, with a progress bar, or on a Ray cluster."""
-    from lag_envs.leaderboard.parallel import map_submissions
-    from lag_envs.workers import SpreadError
+    from lag_envs.leaderboard.parallel import map_submissions, with_bar
 
-    if args.jobs == 1 and args.ray is None:
-        for folder in folders:
-            yield folder, _with_bar(folder, args.nonce, args.episodes)
-        return
     function = partial(verify_folder, nonce=args.nonce, episodes=args.episodes)
-    try:
-        yield from map_submissions(function, folders, args.jobs, args.ray)
-    except SpreadError as error:
-        raise UserError(str(error)) from error
-
-
-def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
-    from tqdm import tqdm
-
-    with tqdm(
-        desc=ascii_text(folder.name), unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5
-    ) as bar:
-
-        def show(done: int, work: int) -> None:
-            bar.total = work
-            bar.update(done - bar.n)
-
-        return verify_folder(folder, nonce, episodes, show)
+    if args.jobs == 1 and args.ray is None:
+        function = partial(with_bar, function)
+    return map_submissions(function, folders, args.jobs, args.ray)
 
 
 def result_lines(result: dict[str, Any]) -> list[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs import store
+from lag_envs.errors import UserError
 from lag_envs.host import machine
 from lag_envs.report.content import Content
 from lag_envs.report.runner import JobResult, module, run_jobs, versions
@@ -34,7 +35,7 @@ class ReportSettings:
     file: str = ""  #: a user's own file, measured in place of the package
 
 
-class NotAReport(ValueError):
+class NotAReport(UserError):
     """The folder holds something else."""
 
 

@@ -22,7 +22,7 @@ from markupsafe import Markup
 from lag_envs import store
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import driving
-from lag_envs.leaderboard.site.scenery import Scenery, scenery_data
+from lag_envs.leaderboard.site.scenery import Scenery, page_json, scenery_data
 
 #: Lists the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
@@ -137,12 +137,17 @@ def write_page(data: Mapping[str, Any], out: Path, url: str = "") -> None:
 
 
 def render(
-    data: Mapping[str, Any], url: str = "", site: Sequence[tuple[str, str]] = (), source: str = ""
+    data: Mapping[str, Any],
+    url: str = "",
+    site: Sequence[tuple[str, str]] = (),
+    source: str = "",
+    documentation: str = "",
 ) -> tuple[dict[str, str], dict[str, str | bytes]]:
     """Return the pages, the overview last, and the files they refer to: content by path.
 
     If the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
-    `source` is the address of the project's files, to which submissions are linked; it ends with a slash.
+    `source` is the address of the project's files, to which submissions are linked, `documentation` that of the
+    environments' pages, ID.html; both end with a slash.
     """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
@@ -153,6 +158,9 @@ def render(
         name = f"assets/{stem}-{found.hexdigest()[:10]}.{kind}"
         files[name] = content
         return name
+
+    def keep_data(stem: str, value: Any) -> str:
+        return keep(stem, "js", f"lagEnvs.put({page_json(value)});\n")
 
     style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
     script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
@@ -170,18 +178,13 @@ def render(
             row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
             replays, live = row.pop("replays"), row.pop("agent")
             row["file"] = None
-            row["live"] = (
-                keep(f"{board['page']}-{i}-live", "js", f"lagEnvs.put({_json(live)});\n")
-                if live and code
-                else None
-            )
+            row["live"] = keep_data(f"{board['page']}-{i}-live", live) if live and code else None
             if replays:
                 # The script that fetches the file knows it by this key.
                 episodes = [scenery.episode(replay) for replay in replays]
-                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({_json(episodes)});\n")
+                row["file"] = keep_data(f"{board['page']}-{i}", episodes)
                 if row["name"] == board["shown"] and not board["film"]:
-                    first = _json(episodes[:1])
-                    board["film"] = keep(f"{board['page']}-film", "js", f"lagEnvs.put({first});\n")
+                    board["film"] = keep_data(f"{board['page']}-film", episodes[:1])
         preview = scenery.preview(board.pop("states"), board.pop("goal_of_states")) if url else None
         board["preview"] = preview and keep(board["page"], "png", preview)
         boards.append(board)
@@ -192,14 +195,14 @@ def render(
     )  # fmt: skip
     templates.filters |= {
         "number": rounded_text, "steps": count_text, "duration": duration, "seconds": seconds,
-        "percent": percent, "condition": condition, "about": _about, "place": place_of,
+        "percent": percent, "condition": condition, "about": _about, "place": place_of, "lowest": lowest,
     }  # fmt: skip
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
         "made": data["made"], "style": style,
-        "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
-        "embed": _embedded, "url": url and url.rstrip("/") + "/",
-        "site": site, "source": source, "preview": next((b["preview"] for b in boards), None),
+        "script": script, "drive": drive, "protocol": data["protocol"],
+        "embed": lambda value: Markup(page_json(value)), "url": url and url.rstrip("/") + "/",
+        "site": site, "source": source, "documentation": documentation, "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
@@ -358,17 +361,15 @@ def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequ
 # --- numbers as text --------------------------------------------------------------------------------------
 
 
-def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
-    """Return a column's sort key."""
-    value = row[key]
-    if key == "name":
-        return str(value).casefold()
-    if key == "success" and isinstance(value, Mapping):
-        return value.get("rate")
-    if isinstance(value, Mapping):
-        numbers = [x for x in value.values() if isinstance(x, int | float)]
-        return min(numbers, default=None)
-    return value
+def lowest(scores: Mapping[str, float | None] | None) -> float | None:
+    """Return the lowest of some scores; None if there are none.
+
+    Examples
+    --------
+    >>> lowest({"noise": 0.9, "pushes": 0.8, "late": None}), lowest({}), lowest(None)
+    (0.8, None, None)
+    """
+    return min((x for x in (scores or {}).values() if x is not None), default=None)
 
 
 def rounded_text(value: Any, digits: int = 3) -> str:
@@ -485,16 +486,6 @@ def _clean(value: Any) -> Any:
     if isinstance(value, str):
         return re.sub(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _json(value: Any) -> str:
-    """Return JSON that cannot end a script element and means the same in JavaScript."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _embedded(value: Any) -> Markup:
-    return Markup(_json(value))
 
 
 def _manifest(out: Path) -> set[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -17,10 +16,10 @@ from lag_envs.leaderboard.architecture import Array, Head
 from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, Linear, Network
 from lag_envs.leaderboard.policies import ControllerPolicy, SubmittedPolicy
-from lag_envs.leaderboard.site.scenery import picture_data
+from lag_envs.leaderboard.site.scenery import page_json, picture_data
 from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.mechanics.recording import parameter_names
+from lag_envs.mechanics.recording import parameter_values
 from lag_envs.replay import LEVELS, VERSION
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.derivation import form_of
@@ -62,8 +61,7 @@ def script_of(kind: type[Task]) -> str:
     env = Unfused(task)
     program, names = env.program, ", ".join(env.program.names)
     constants = ", ".join(map(_number, program.constants))
-    about = json.dumps(_about(kind, env), separators=(",", ":"), allow_nan=False)
-    about = about.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    about = page_json(_about(kind, env))
     return (
         f'"use strict";\n(() => {{\n{program.javascript}'
         f"lagEnvs.put({{ functions: {{ {names} }}, constants: [{constants}], about: {about} }});\n}})();\n"
@@ -130,9 +128,9 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     `MARKS`. The limit of the controls is a factor, `shown` in units of the only control or in per cent.
     """
     task, program = env.task, env.program
-    names, units = list(program.given), dict(zip(parameter_names(task.scene), _units(task), strict=True))
+    names, fields = list(program.given), type(task.scene).__dataclass_fields__
     fixed = {*program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
-    values = {name: getattr(task.scene, name) for name in units if name not in fixed}
+    values = {name: value for name, value in parameter_values(task.scene).items() if name not in fixed}
     marked = {
         name: others
         for name, value in values.items()
@@ -144,8 +142,9 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     for name, others in marked.items():
         if together or _follows(env, {name: values[name]}):
             looks = [_look(other) for other in others]
-            at = {"name": name, "unit": units[name], "at": names.index(f"self_{name}"), "value": values[name]}
-            found.append(at | ({"looks": looks} if looks[0] != looks[-1] else {}))
+            unit, at = fields[name].metadata["unit"], names.index(f"self_{name}")
+            slider = {"name": name, "unit": unit, "at": at, "value": values[name]}
+            found.append(slider | ({"looks": looks} if looks[0] != looks[-1] else {}))
     acting = task.formulas.acting
     if task.formulas.clipped and acting and all(a.low == -a.high for a in acting):
         limit = {"name": "control limit", "at": names.index("strength"), "value": 1.0}
@@ -169,11 +168,6 @@ def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
     """Return whether a script with changed parameters does the same as tasks made with them."""
     others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
     return bool(others) and all(_steps_as(env, list(values), other) for other in others)
-
-
-def _units(task: Task) -> list[str]:
-    fields = type(task.scene).__dataclass_fields__
-    return [fields[name].metadata["unit"] for name in parameter_names(task.scene)]
 
 
 def _look(task: Task) -> dict[str, Any]:

@@ -7,6 +7,7 @@ small. A number that never changes is written once.
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -201,6 +202,12 @@ class Scenery:
             of = [as_column(x, unit) for x, unit in zip(poses.T, self._units, strict=True)]
             frames.append([columns.setdefault(str(x), (len(columns), x))[0] for x in of])
         return {"columns": [x for _, x in columns.values()], "frames": frames}
+
+
+def page_json(value: Any) -> str:
+    """Return JSON that cannot end a script element and means the same in JavaScript."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def as_column(values: ArrayLike, unit: float) -> int | list[int]:

@@ -664,7 +664,7 @@
 
   /** Build the driver into an element and return it. */
   function open(root, board, code, tools) {
-    const { make, all, text, symbol, fit, paint, placed, apart, windowOf, posesAt, load, calm } = tools;
+    const { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, calm } = tools;
     const { about } = code;
     const known = board.known && board.known.best !== board.known.random ? board.known : null;
     const scoreOf = (total) => (total - known.random) / (known.best - known.random);
@@ -694,7 +694,7 @@
     const copy = button("copy", "Copy link");
     const share = make("div", { class: "share" }, link, copy);
     const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
-    root.replaceChildren(stage, bar, readout, verdict, share, panel, said);
+    root.replaceChildren(verdict, stage, bar, readout, share, panel, said);
     copy.disabled = watch.hidden = episodeLabel.hidden = true;
 
     const hands = new Hands(about, () => {
@@ -718,9 +718,17 @@
       (control) => (control.meaning ? "" : words(control)),
       (unit) => ` in ${unit}`,
     );
+    // Without a key the first of listed actions acts, which may push too.
+    const unasked = about.controls
+      .map(({ name, unit, values }, i) => (values[about.rest[i]] ? ` Without a key, ${symbol(name)} is ${text(values[about.rest[i]])} ${unit}.` : ""))
+      .join("");
     const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
-    const starting = (keys) =>
-      `${keys ? `${keys}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space or a tap starts.${nothing}`;
+    const touched = matchMedia("(hover: none)").matches;
+    const starting = (keys) => {
+      const by = touched ? "A tap starts. Then hold a finger on the picture: the farther from the middle, the stronger."
+        : `${keys}; or use the pointer or a gamepad. Space or a tap starts.`;
+      return `${keys ? by : "There is nothing to control here: just watch. Space or a tap starts."}${unasked}${nothing}`;
+    };
     stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
 
     let { constants } = code;
@@ -752,10 +760,7 @@
 
     /** The ghost: an agent, stored episodes, or the keys of a link. */
     const GHOSTS = {
-      live: (row) => load(board.rows[row].live).then((data) => {
-        const act = agentOf(data);
-        return { name: board.rows[row].name, act: (episode) => act(episode) };
-      }),
+      live: (row) => load(board.rows[row].live).then((data) => ({ name: board.rows[row].name, act: agentOf(data) })),
       stored: (row) => tools.episodes(board.rows[row].file).then((replays) => ({ name: board.rows[row].name, replays })),
       link: () => {
         const { seed: start, keys } = linked; // another link may come while this one's ghost runs
@@ -777,6 +782,11 @@
       ghostSelect.value = chosen;
     }
 
+    /** What a stored episode is, with the seed of its start if that is known. */
+    function seeded({ label: name = "episode", return: total, reset_seed: start }) {
+      return `${name}${start === undefined ? "" : `, seed ${start}`}, return ${text(total, 2)}`;
+    }
+
     async function chooseGhost() {
       const [kind, row] = ghostSelect.value.split(":");
       const asked = ghostSelect.value;
@@ -793,7 +803,7 @@
         if (ghostSelect.value !== asked) return;
         ghost = found;
         if (ghost.replays) {
-          episodeSelect.replaceChildren(...ghost.replays.map((replay, i) => option(String(i), `${replay.label ?? "episode"}, return ${text(replay.return, 2)}`)));
+          episodeSelect.replaceChildren(...ghost.replays.map((replay, i) => option(String(i), seeded(replay))));
           episodeLabel.hidden = false;
           chooseEpisode();
           return;
@@ -801,22 +811,28 @@
         if (ghost.seed !== undefined) seed = ghost.seed;
       }
       restart();
+      tell(starting(how), starting(heard));
       if (ghost?.act) warmUp();
     }
 
     function chooseEpisode() {
       ghost.replay = ghost.replays[Number(episodeSelect.value)] ?? ghost.replays[0];
-      if (ghost.replay.reset_seed !== undefined) seed = big(ghost.replay.reset_seed);
-      else tell("The seed of this episode is not known: the ghost starts elsewhere.");
+      const start = ghost.replay.reset_seed;
+      if (start !== undefined) seed = big(start);
       restart();
+      tell(start === undefined ? "The seed of this episode is not known: the ghost starts elsewhere." : starting(how), starting(heard));
     }
 
     function startGhost() {
-      if (!ghost) return;
-      if (ghost.act) {
-        ghost.episode = new Episode(code, seed, constants);
-        [ghost.past, ghost.now] = [ghost.episode.poses(), ghost.episode.poses()];
-      }
+      if (!ghost?.act) return;
+      ghost.episode = new Episode(code, seed, constants);
+      [ghost.past, ghost.now] = [ghost.episode.poses(), ghost.episode.poses()];
+    }
+
+    function dismissGhost() {
+      ghost = null;
+      ghostSelect.value = "";
+      episodeLabel.hidden = true;
     }
 
     function stepGhost() {
@@ -989,8 +1005,7 @@
     // --- what is to be seen
 
     function show(part) {
-      const { pen, width, height } = fit(canvas);
-      pen.clearRect(0, 0, width, height);
+      const { pen, width, height } = cleared(canvas);
       if (width && picture && about.frames) {
         const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
         const poses = mixedPoses(past, now, part, between);
@@ -1018,12 +1033,10 @@
       return low === -high ? high * share : low + (high - low) * (0.5 + 0.5 * share);
     }
 
-    const cells = new Map();
-
     function readOut(beside) {
       const score = known && (finished(me) ? text(scoreOf(me.total)) : !ended() && "at the end") || "–";
       const keys = rerunning ? rerunning.keys[Math.max(0, me.steps - 1)] ?? [] : mine[mine.length - 1] ?? [];
-      const entries = [
+      writeList(readout, [
         ["Time", `${text(me.steps * about.dt, 2)} s`],
         ["Return", text(me.total, 2)],
         ...(ghost ? [["Ghost's return", beside ? text(beside.total, 2) : "–"]] : []),
@@ -1034,15 +1047,7 @@
           return [symbol(name), keys[i] === undefined ? "–" : `${text(controlOf(keys[i], control), digits)} ${unit}`.trim()];
         }),
         ...board.state_names.map((name, i) => [symbol(name), `${text(me.f[i], 2)} ${board.state_units[i] ?? ""}`]),
-      ];
-      if ([...cells.keys()].join() !== entries.map(([name]) => name).join()) {
-        cells.clear();
-        readout.replaceChildren(...entries.map(([name]) => {
-          cells.set(name, make("dd"));
-          return make("div", {}, make("dt", {}, name), cells.get(name));
-        }));
-      }
-      for (const [name, value] of entries) if (cells.get(name).textContent !== value) cells.get(name).textContent = value;
+      ]);
     }
 
     // --- sliders
@@ -1071,32 +1076,30 @@
       };
       say();
       input.addEventListener("input", () => {
-        change();
-        picture = look();
         rerunning = null;
-        restart();
-        tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
+        change();
       });
       panel.append(make("label", {}, make("span", {}, name), input, output));
       return { slider, input, say };
     });
 
-    /** Apply the sliders' values and all that follows from them. */
+    /** Apply the sliders' values and all that follows from them, and start over. */
     function change() {
       const values = inputs.map(({ say }) => say());
       constants = code.constants;
-      if (inputs.every(({ input }) => Number(input.value) === 0)) return;
-      constants = Float64Array.from(code.constants);
-      inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
-      code.functions.derive(constants);
+      if (inputs.some(({ input }) => Number(input.value) !== 0)) {
+        constants = Float64Array.from(code.constants);
+        inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
+        code.functions.derive(constants);
+      }
+      picture = look();
+      restart();
+      tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
     }
     const reset = button("reset", "Reset");
     reset.addEventListener("click", () => {
       for (const { input } of inputs) input.value = "0";
       change();
-      picture = look();
-      restart();
-      tell("The machine is as it was: drives are scored again.");
     });
     panel.append(reset);
     panel.hidden = !inputs.length;
@@ -1107,10 +1110,7 @@
     function checkLink(hash) {
       linked = rerunning = null;
       watch.hidden = true;
-      if (ghostSelect.value.startsWith("link:")) {
-        ghostSelect.value = "";
-        ghost = null;
-      }
+      if (ghostSelect.value.startsWith("link:")) dismissGhost();
       listGhosts();
       let told;
       try {
@@ -1128,11 +1128,9 @@
       delete verdict.dataset.true;
       const go = () => {
         const until = performance.now() + 4;
-        while (episode.steps < told.keys.length && performance.now() < until) {
-          if (episode.over) break;
-          episode.step(actionOf(told.keys[episode.steps], about));
-        }
-        if (episode.steps < told.keys.length && !episode.over) {
+        const more = () => episode.steps < told.keys.length && !episode.over;
+        while (more() && performance.now() < until) episode.step(actionOf(told.keys[episode.steps], about));
+        if (more()) {
           requestAnimationFrame(go);
           return;
         }
@@ -1217,11 +1215,7 @@
     }
 
     function another() {
-      if (ghost?.replays || ghost?.seed !== undefined) {
-        ghostSelect.value = "";
-        ghost = null;
-        episodeLabel.hidden = true;
-      }
+      if (ghost?.replays || ghost?.seed !== undefined) dismissGhost();
       seed = big(Math.floor(Math.random() * 2 ** 32));
       afresh();
     }
@@ -1287,8 +1281,7 @@
     }
     watch.addEventListener("click", () => {
       running = false;
-      ghostSelect.value = "";
-      ghost = null;
+      dismissGhost();
       reset.click();
       seed = linked.seed;
       rerunning = linked;

@@ -16,19 +16,26 @@
 
   // --- helpers ---------------------------------------------------------------------------------------------
 
-  /** Make an element; attributes are set as such, children are elements or text. */
-  function make(name, attributes = {}, ...children) {
-    const element = document.createElement(name);
+  /** A function that makes an element: attributes are set as such, children are elements or text. */
+  const maker = (create) => (name, attributes = {}, ...children) => {
+    const element = create(name);
     for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
     element.append(...children);
     return element;
-  }
+  };
+  const make = maker((name) => document.createElement(name));
+  const draw = maker((name) => document.createElementNS(SVG, name));
 
-  function draw(name, attributes = {}, ...children) {
-    const element = document.createElementNS(SVG, name);
-    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-    element.append(...children);
-    return element;
+  /** Write names and values into a list; elements are reused, so that the layout does not jump with every frame. */
+  function writeList(list, entries) {
+    const names = [...list.children].map((row) => row.firstChild.textContent);
+    if (names.join() !== entries.map(([name]) => name).join()) {
+      list.replaceChildren(...entries.map(([name]) => make("div", {}, make("dt", {}, name), make("dd"))));
+    }
+    entries.forEach(([, value], i) => {
+      const cell = list.children[i].lastChild;
+      if (cell.textContent !== value) cell.textContent = value;
+    });
   }
 
   const isNumber = (x) => typeof x === "number" && Number.isFinite(x);
@@ -55,9 +62,7 @@
     if (!(rough > 0) || !Number.isFinite(rough)) return { step: 1, at: [low] };
     const power = 10 ** Math.floor(Math.log10(rough));
     const step = power * ([1, 2, 5, 10].find((x) => x * power >= 0.7 * rough) ?? 10);
-    const at = [];
-    for (let i = Math.ceil(low / step - 1e-6); i * step <= high + 1e-6 * step; i++) at.push(i * step);
-    return { step, at };
+    return { step, at: multiples(low, high, step) };
   }
 
   /** Multiples of a step that lie between two numbers. */
@@ -108,12 +113,12 @@
     }));
   }
 
+  const lengthOf = (points) => points.slice(1).reduce((sum, point, i) => sum + distance(points[i], point), 0);
+
   /** The first part of a line. */
   function beginning(points, part) {
     if (part >= 1) return points;
-    let room = 0;
-    for (let i = 1; i < points.length; i++) room += distance(points[i - 1], points[i]);
-    room *= part;
+    let room = part * lengthOf(points);
     const kept = [points[0]];
     for (let i = 1; i < points.length; i++) {
       const [a, b] = [points[i - 1], points[i]];
@@ -199,6 +204,21 @@
     return { pen, width, height };
   }
 
+  /** Fit a canvas and clear it. */
+  function cleared(canvas) {
+    const fitted = fit(canvas);
+    fitted.pen.clearRect(0, 0, fitted.width, fitted.height);
+    return fitted;
+  }
+
+  /** Draw only within a rectangle, until the pen is restored. */
+  function clip(pen, x, y, width, height) {
+    pen.save();
+    pen.beginPath();
+    pen.rect(x, y, width, height);
+    pen.clip();
+  }
+
   function trace(pen, points, closed) {
     pen.beginPath();
     points.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)));
@@ -242,8 +262,7 @@
 
   /** An arrow as long as its points say; a short one is thinner. */
   function arrow(pen, points, full, colour) {
-    let length = 0;
-    for (let i = 1; i < points.length; i++) length += distance(points[i - 1], points[i]);
+    const length = lengthOf(points);
     if (length < 1.5) return;
     const width = full * Math.min(1, length / (4 * full));
     const shaft = beginning(points, 1 - (3 * width) / length);
@@ -309,12 +328,16 @@
     const frame = (now) => {
       if (!running || !seen) return;
       begun ||= now;
+      // It rests while somebody drives, whose frames it would slow down.
+      if (find(".stage[data-driving]")) {
+        requestAnimationFrame(frame);
+        return;
+      }
       const length = replay.end * replay.dt;
       const time = Math.min(((now - begun) / 1000) % (length + 1), length);
       const at = Math.min(Math.floor(time / replay.dt), replay.end - 1);
       const poses = posesAt(replay.poses, board.picture.units, at, Math.min(time / replay.dt - at, 1));
-      const { pen, width, height } = fit(canvas);
-      pen.clearRect(0, 0, width, height);
+      const { pen, width, height } = cleared(canvas);
       const view = windowOf(board.picture, poses);
       const box = { x: 0.02 * width, y: 0.02 * height, width: 0.96 * width, height: 0.96 * height };
       if (width) paint(pen, box, view, placed(board.picture, poses, view));
@@ -407,7 +430,6 @@
       row: null,
       replay: null,
       asked: 0,
-      cells: null,
     }));
     const play = find(".play", root);
     const range = find(".scrub input", root);
@@ -463,12 +485,10 @@
     }
 
     function showSide(side) {
-      const { pen, width, height } = fit(side.canvas);
-      pen.clearRect(0, 0, width, height);
+      const { pen, width, height } = cleared(side.canvas);
       if (!side.replay) {
-        side.readout.replaceChildren();
-        side.cells = null;
-        clearPhase(side.phase);
+        writeList(side.readout, []);
+        cleared(side.phase);
         return;
       }
       const now = momentOf(side);
@@ -478,7 +498,7 @@
         paint(pen, box, view, placed(board.picture, now.poses, view));
       }
       const over = now.frame >= side.replay.end;
-      fill(side, [
+      writeList(side.readout, [
         ["Time", `${text(now.time, 2)} s${over ? ", end" : ""}`],
         ["Action", [now.action].flat().map((v) => text(v)).join(", ")],
         ["Reward", text(now.reward)],
@@ -489,21 +509,6 @@
       ]);
       const chosen = pairs[pair.value] ?? pairs[0];
       if (chosen) drawPhase(side, chosen, now, board, sides);
-    }
-
-    /** Write the read-out; its elements are reused, so that the layout does not jump with every frame. */
-    function fill(side, entries) {
-      if (side.cells?.length !== entries.length) {
-        side.cells = entries.map(([name]) => {
-          const value = make("dd");
-          side.readout.append(make("div", {}, make("dt", {}, name), value));
-          return value;
-        });
-        side.readout.replaceChildren(...side.cells.map((cell) => cell.parentElement));
-      }
-      entries.forEach(([, value], i) => {
-        if (side.cells[i].textContent !== value) side.cells[i].textContent = value;
-      });
     }
 
     /** Describe the picture to screen readers once it is at rest. */
@@ -679,8 +684,7 @@
   function drawTraces(canvas, sides, time, end) {
     const shown = tracesOf(sides);
     canvas.style.height = `${4.75 * shown.length}rem`;
-    const { pen, width, height } = fit(canvas);
-    pen.clearRect(0, 0, width, height);
+    const { pen, width, height } = cleared(canvas);
     if (!width || !end) return;
     const { left, right } = lanes(width);
     const x = (t) => left + ((width - left - right) * t) / end;
@@ -710,10 +714,7 @@
         trace(pen, [[left, y(v)], [width - right, y(v)]], false);
         pen.stroke();
       }
-      pen.save();
-      pen.beginPath();
-      pen.rect(left, top - 2, width - left - right, lane + 4);
-      pen.clip();
+      clip(pen, left, top - 2, width - left - right, lane + 4);
       for (const side of sides) {
         if (!side.replay) continue;
         pen.strokeStyle = ink.series[side.row % COLOURS];
@@ -760,11 +761,6 @@
     }));
   }
 
-  function clearPhase(canvas) {
-    const { pen, width, height } = fit(canvas);
-    pen.clearRect(0, 0, width, height);
-  }
-
   function rangeOf(values) {
     let [low, high] = [Infinity, -Infinity];
     for (const v of values) if (isNumber(v)) [low, high] = [Math.min(low, v), Math.max(high, v)];
@@ -807,17 +803,11 @@
       const x = (v) => box.left + (box.width * (v - spanX[0])) / (spanX[1] - spanX[0]);
       const y = (v) => box.top + box.height * (1 - (v - spanY[0]) / (spanY[1] - spanY[0]));
       Object.assign(side.background, { x, y });
-      back.save();
-      back.beginPath();
-      back.rect(box.left, box.top, box.width, box.height);
-      back.clip();
+      clip(back, box.left, box.top, box.width, box.height);
       if (pair.value) shade(back, box, pair.value, x, y);
       back.restore();
       axes(back, box, spanX, spanY, pair.labels, x, y, getComputedStyle(side.phase).fontFamily);
-      back.save();
-      back.beginPath();
-      back.rect(box.left, box.top, box.width, box.height);
-      back.clip();
+      clip(back, box.left, box.top, box.width, box.height);
       back.lineJoin = "round";
       const { states } = side.replay;
       // A light line under the coloured one keeps it readable on any shade.
@@ -1221,7 +1211,7 @@
     const root = find("#drive");
     if (!root) return null;
     const [begin, said] = [find(".begin", root), find(".status", root)];
-    const tools = { make, all, text, symbol, fit, paint, placed, apart, windowOf, posesAt, load, episodes, calm };
+    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, calm };
     let driver = null;
 
     async function open(wanted) {
