@@ -15,10 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from agents.report import rate_cells
 from agents.results import results_json
 from agents.run import UserError, reports_errors
 from lag_envs.benchmark.actions import random_actions
-from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import batch
 from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import Contestant, Run, measure_rates
@@ -62,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [
         rates_and_ratio(adapter, dummy) for adapter, dummy in zip(*[iter(steps + learn)] * 2, strict=True)
     ]
-    print("\n".join(table_lines(rows)))
+    head = ("", "environments", "adapter", "DummyVecEnv", "ratio")
+    print("\n".join(aligned([head, *map(rate_cells, rows)])))
     if args.output:
         about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
         write_file(args.output, results_json(about | {"env": ENV, "rows": rounded_data(rows)}))
@@ -119,18 +120,6 @@ def rates_and_ratio(adapter: Contestant, dummy: Contestant) -> dict[str, Any]:
     }  # fmt: skip
     pairs = ratios(adapter.rates, dummy.rates)
     return row | ({"ratio": quartiles(pairs)} if pairs else {})
-
-
-def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the lines of the table."""
-    cells = [("", "environments", "adapter", "DummyVecEnv", "ratio")]
-    for row in rows:
-        if row["problem"]:
-            cells.append((row["kind"], str(row["num_envs"]), row["problem"]))
-            continue
-        both = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
-        cells.append((row["kind"], str(row["num_envs"]), *both, f"{row['ratio'][1]:.1f}"))
-    return aligned(cells)
 
 
 if __name__ == "__main__":

@@ -209,7 +209,9 @@ class Evaluation:
             self.absent.append(f"optimal: {reason}")
         else:
             mark = digest("optimum.py", "value_iteration.py", RESULTS / f"{self.env}.json")
-            self.entrants.append(Entrant(self.env, "optimal", "optimal", partial(GreedyPolicy, self.env), mark))
+            self.entrants.append(
+                Entrant(self.env, "optimal", "optimal", partial(GreedyPolicy, self.env), mark)
+            )
         folders = [file.parent for file in runs.glob(f"{self.env}/*/seed*/{RESULT}")]
         first: dict[str, Entrant] = {}
         for folder in sorted(folders, key=lambda p: (p.parent.name, len(p.name), p.name)):
