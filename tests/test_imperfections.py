@@ -302,24 +302,16 @@ def test_an_environment_has_the_bits_of_one_made_with_the_drawn_values():
 # --- delays -------------------------------------------------------------------------------------------------
 
 
-slow = pytest.mark.slow
-
-
 @pytest.mark.parametrize(
     ("action_delay", "observation_delay"),
     [
         ((0.004, 0.05), (0.0, 0.05)),
-        *(
-            pytest.param(*delays, marks=slow)
-            for delays in [
-                ((0.004, 0.05), 0.027),
-                (0.033, 0.027),
-                (0.06, 0.01),
-                (0.013, 0.04),
-                (0.033, (0.013, 0.014)),
-                (0.0, (0.02, 0.08)),
-            ]
-        ),
+        slow((0.004, 0.05), 0.027),
+        slow(0.033, 0.027),
+        slow(0.06, 0.01),
+        slow(0.013, 0.04),
+        slow(0.033, (0.013, 0.014)),
+        slow(0.0, (0.02, 0.08)),
     ],
 )
 def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
@@ -366,7 +358,7 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
         assert observation == pytest.approx(true, abs=1e-6)
 
 
-@slow
+@pytest.mark.slow
 def test_lag_against_simulate():
     keywords = {
         "lag": 0.03,
@@ -403,7 +395,7 @@ def test_first_commands_under_way_are_zero_control():
         assert env.unwrapped.control == (0.0 if t < 2 else 5.0)
 
 
-@slow
+@pytest.mark.slow
 def test_whole_delays_are_not_divided_and_shift_what_is_done():
     late, prompt = (gym.make(ID, **keywords) for keywords in ({"action_delay": 0.06}, {}))
     actions = np.random.default_rng(0).uniform(-1, 1, (40, 1)).astype(np.float32)
@@ -600,7 +592,7 @@ def test_scripts_refuse_them():
         Unfused(make_task(ID, **ALL))
 
 
-@slow
+@pytest.mark.slow
 def test_pictures_show_the_drawn_parameters():
     keywords = {"randomize": {"com_distance": (0.5, 2.0)}, "duration": 0.5}
     drawn = gym.make(ID, render_mode="rgb_array", **keywords)
@@ -619,7 +611,7 @@ def test_pictures_show_the_drawn_parameters():
     assert not np.array_equal(*envs.render())
 
 
-@slow
+@pytest.mark.slow
 def test_a_piece_longer_by_a_rounding_than_the_lag_is_followed_is_taken():
     env = gym.make("PivotedBarFree-v0", dt=0.05, lag=0.01, observation_delay=0.03)
     env.reset(seed=5)

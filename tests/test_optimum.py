@@ -277,14 +277,11 @@ def test_agent_takes_one_observation_as_a_batch(brake):
     np.testing.assert_allclose(one, play(incline.Brake.id, brake, range(5, 8)), rtol=1e-12)
 
 
-def test_agent_counts_the_steps_of_each_episode(brake):
-    observation = np.array([[1.0, 0.5], [2.0, 0.5]])
-    _, taken = brake.predict(observation)
-    _, taken = brake.predict(observation, taken, np.array([False, True]))
-    assert taken.tolist() == [2, 1]
-    action, taken = brake.predict(observation[0], np.array([499]))  # the last step, and past the end
+def test_agent_acts_in_the_last_step_and_past_the_end(brake):
+    observation = np.array([1.0, 0.5])
+    action, taken = brake.predict(observation, np.array([499]))
     assert action.shape == (1,) and action.dtype == np.float32 and taken.tolist() == [500]
-    brake.predict(observation[0], taken)
+    brake.predict(observation, taken)
 
 
 def test_agent_is_there_for_what_is_solved():

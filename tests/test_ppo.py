@@ -169,9 +169,6 @@ def test_the_policy_that_was_written_is_the_one_that_was_evaluated(frames, tmp_p
     with pytest.raises(UserError, match="act in the package's environments alone"):
         watch.load_agent("OwnCentre-v0", Centre(), str(run.path(MODEL)))
     assert result["versions"]["torch"] and result["hyperparameters"] == run.hyperparameters
-    run.path(MODEL).write_bytes(b"nonsense")
-    with pytest.raises(UserError, match=r"the policy in .* cannot be read"):
-        load_policy(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -352,10 +349,7 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
     ("given", "message"),
     [
         (["PivotedBra-v0"], "did you mean PivotedBar-v0"),
-        (
-            [ENV, "--gamma", "1.5"],
-            "gamma: Input should be less than or equal to 1, got 1.5",
-        ),
+        ([ENV, "--gamma", "1.5"], "gamma: Input should be less than or equal to 1, got 1.5"),
         ([ENV, "--frames", "0"], "frames: Input should be greater than or equal to 1, got 0"),
         ([ENV, "--actor", "0"], "actor.0: Input should be greater than 0, got 0"),
         ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = 6144, got 1000\n"),
