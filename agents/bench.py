@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from agents.report import rate_cells
-from agents.results import results_json
 from agents.run import UserError, reports_errors
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.environments import batch
@@ -25,7 +24,7 @@ from lag_envs.benchmark.rounds import Contestant, Run, measure_rates
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import ONE_THREAD, machine
 from lag_envs.options import module_parser, new_file
-from lag_envs.store import write_file
+from lag_envs.store import readable_json, write_file
 from lag_envs.tables import aligned
 
 ENV = "PivotedBar-v0"
@@ -66,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\n".join(aligned([head, *map(rate_cells, rows)])))
     if args.output:
         about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
-        write_file(args.output, results_json(about | {"env": ENV, "rows": rounded_data(rows)}))
+        write_file(args.output, readable_json(about | {"env": ENV, "rows": rounded_data(rows)}))
     return 0 if complete and not any(row["problem"] for row in rows) else 1
 
 

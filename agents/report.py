@@ -208,14 +208,14 @@ def brief(name: str, agent: Data) -> str:
     return f"{learner_label(name)} {len(agent['seeds'])} × {agent['steps'] / 1000.0:.0f}k"
 
 
-def _stored(file: Path) -> Data:
+def stored(file: Path) -> Data:
     """Return what a command has measured; nothing if it has not been run."""
     return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
 def _behaviour(env_id: str) -> list[str]:
     """Return the measurements of `python -m agents.behaviour`."""
-    found = _stored(BEHAVIOUR)
+    found = stored(BEHAVIOUR)
     agents = found.get("envs", {}).get(env_id, {})
     if not any(agents.values()):
         return []
@@ -245,7 +245,7 @@ def _behaviour(env_id: str) -> list[str]:
 
 def _real_time(env_id: str) -> list[str]:
     """Return the measurements of `python -m agents.real_time`."""
-    found, told = _stored(REAL_TIME), []
+    found, told = stored(REAL_TIME), []
     for name, row in found.get("envs", {}).get(env_id, {}).items():
         ms = {what: f"{1e3 * row[what]:.3g} ms" for what in ("interval", "median", "p99", "longest")}
         late = f"{row['late']:.2%}" if row["late"] else "none"
@@ -400,7 +400,7 @@ def _about(data: Data) -> str:
 
 def _optimum(env_id: str) -> list[str]:
     """Return the results of `python -m agents.optimum`, with its picture."""
-    if not (found := _stored(OPTIMA / f"{env_id}.json")):
+    if not (found := stored(OPTIMA / f"{env_id}.json")):
         return []
     bound, estimate, lower = found["bound"], found["estimate"], found["lower"]
     easier = "" if lower is not None else f" of {found['solved']}, which is easier,"
