@@ -1,57 +1,21 @@
-"""Learners by gradients and by a controller: they learn, repeat and resume bit for bit."""
+"""Learners by gradients and by a controller; `test_ppo` has the tests of all our learners."""
 
 import copy
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from covering import slow
-from test_ppo import learnt
-from trainings import go
+from test_ppo import OTHERS
 
-from agents import cloning, learners, shac, train
-from agents.learners import load_policy, zoo_hyperparameters
-from agents.run import RESULT, Run, UserError, fresh_seeds
+from agents import cloning, shac, train
+from agents.learners import zoo_hyperparameters
+from agents.run import UserError, fresh_seeds
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import score
 from lag_envs.tasks import cart_pole, pivoted_bar
 
 FREE, TRACK = pivoted_bar.SwingUpFree.id, pivoted_bar.SwingUp.id
-#: For trainings that take a fraction of a second.
-SHORT = {
-    "shac": {"n_envs": 8, "n_steps": 16, "critic": [8]},
-    "cloning": {"n_envs": 8, "n_steps": 16, "n_updates": 2, "batch_size": 8},
-}
-each_learner = pytest.mark.parametrize("algo", SHORT)
-
-
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
-    monkeypatch.setattr(learners, "EPISODES", 5)
-    monkeypatch.setattr(learners, "TEST_EPISODES", 2)
-    monkeypatch.setattr(learners, "TESTS", 3)
-
-
-def make_run(folder, algo, seed=3):
-    return Run(Path(folder), FREE, algo, seed, 768, zoo_hyperparameters(algo, FREE) | SHORT[algo])
-
-
-@each_learner
-def test_a_seed_decides_everything_with_interruptions_or_without(algo, tmp_path):
-    whole, other, cut = (make_run(tmp_path / name, algo) for name in ("a", "b", "c"))
-    other.seed = 4
-    assert go(whole) and go(other)
-    assert not go(cut, 384)  # a window after the last checkpoint
-    cut = make_run(tmp_path / "c", algo)
-    assert cut.load_checkpoint() is not None and 0 < cut.trained <= 384
-    torch.manual_seed(0)
-    assert go(cut)
-    assert learnt(cut) == learnt(whole) != learnt(other)
-    result = json.loads(whole.path(RESULT).read_text())
-    policy = load_policy(whole.folder)
-    assert play(FREE, policy, fresh_seeds(5)).tolist() == result["evaluation"]["returns"]
 
 
 @pytest.mark.parametrize(("env_id", "share"), [(FREE, 0.5), (TRACK, 0.01)])
@@ -124,7 +88,7 @@ def test_mistakes_are_named(algo, env_id, changes, message):
 
 @pytest.mark.slow
 def test_commands_know_them(tmp_path, capsys):
-    given = [FREE, "--algo", *SHORT, "--steps", "6400", "--output", str(tmp_path)]
+    given = [FREE, "--algo", *OTHERS, "--steps", "6400", "--output", str(tmp_path)]
     assert train.main([*given, "--jobs", "1"]) == 0
     output = capsys.readouterr().out
-    assert all(f"{FREE}, {algo}, " in output for algo in SHORT)
+    assert all(f"{FREE}, {algo}, " in output for algo in OTHERS)
