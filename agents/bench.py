@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.report import rate_cells
-from agents.run import UserError, reports_errors
+from agents.run import check_numbers, reports_errors
 from lag_envs.benchmark.actions import random_actions
 from lag_envs.benchmark.environments import batch
 from lag_envs.benchmark.results import quartiles, ratios
@@ -48,8 +48,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     args = parser().parse_args(arguments)
-    if args.rounds < 1:
-        raise UserError(f"--rounds must be at least 1, got {args.rounds}")
+    check_numbers(args, rounds=1)
     os.environ.update(ONE_THREAD)
     kinds = {"adapter": make_adapter, "DummyVecEnv": dummy}
     steps = [

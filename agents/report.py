@@ -271,7 +271,7 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
         rows.append(
             [
                 learner_label(name),
-                with_interval({"value": found["value"], **_ends(found["interval"])}),
+                _pooled(found),
                 f"{len(found['envs'])}: {', '.join(found['envs'])}",
                 _span(len(agent["seeds"]) for agent in agents),
                 _span(agent["steps"] for agent in agents),
@@ -296,7 +296,7 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
             env_id,
             labelled(one, env["agents"][one]),
             labelled(other, env["agents"][other]),
-            with_interval({"value": found["value"], **_ends(found["interval"])}),
+            _pooled(found),
         ]
         for env_id, env in envs.items()
         for one, others in env["improvement"].items()
@@ -454,8 +454,10 @@ def rate_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     return *first, *(short(quartiles(row[n])[1]) for n in ("adapter", "dummy")), f"{row['ratio'][1]:.1f}"
 
 
-def _ends(interval: Sequence[float] | None) -> Data:
-    return dict(zip(("low", "high"), interval or (math.nan, math.nan), strict=True))
+def _pooled(found: Data) -> str:
+    """Return a value over several runs with its interval, if it has one."""
+    low, high = found["interval"] or (None, None)
+    return with_interval({"value": found["value"], "low": low, "high": high})
 
 
 def _image(file: str, text: str) -> str:

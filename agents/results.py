@@ -14,7 +14,7 @@ from pathlib import Path
 
 from agents.analysis import Data, best_first, chances_of_improvement, summarise_env, summarise_learners
 from agents.measure import Evaluation, MeasurementJob, measure_policies
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, check_numbers, reports_errors
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import installed_versions, machine
@@ -82,8 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes = usual if args.episodes is None else args.episodes
         if not 1 <= episodes <= 1_000_000:
             raise UserError(f"--episodes must lie between 1 and 1000000, got {episodes}")
-        if args.changed is not None and args.changed < 1:
-            raise UserError(f"--changed must be at least 1, got {args.changed}")
+        check_numbers(args, changed=1)
         if not args.new:
             load_summary(output)  # fail now, not after everything has been measured
         found = measure_all(envs, args.agents, args.runs, episodes, args.changed)

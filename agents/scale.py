@@ -26,7 +26,7 @@ from agents.learners import learner_label
 from agents.measure import Entrant, learned_policy
 from agents.optimum import GreedyPolicy, played
 from agents.results import ROOT, write_envs
-from agents.run import RESULT, UserError, check_env, read_result, reports_errors
+from agents.run import RESULT, UserError, check_env, check_numbers, read_result, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
@@ -73,9 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("--output", type=new_file, metavar="FILE", help="add the numbers to this JSON file")
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or list(TASKS)
-    for name in ("batches", "planned"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name} must be at least 1, got {getattr(args, name)}")
+    check_numbers(args, batches=1, planned=1)
     if not 1 <= args.size <= BATCH:
         raise UserError(f"--size must lie between 1 and {BATCH}, got {args.size}")
     kept: dict[str, Any] = {}
