@@ -82,6 +82,17 @@ def one_by_one(env_id, agent, seeds, **options):
     return np.array(returns)
 
 
+class Noisy:
+    """An agent, with noise on its actions."""
+
+    def __init__(self, agent, size):
+        self.agent, self.size, self.rng = agent, size, np.random.default_rng(0)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        action, state = self.agent.predict(observation, state)
+        return (action + self.size * self.rng.normal(size=action.shape)).astype(np.float32), state
+
+
 def trace(env, given):
     """Return the results of steps, arrays as bytes; each episode is followed by the next."""
     out = []

@@ -33,7 +33,7 @@ from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergySha
 from lag_envs.controllers.tracking import Tracking, search, waves
 from lag_envs.envs.model import Model
 from lag_envs.envs.single import LagrangianEnv
-from lag_envs.evaluation.rollout import play
+from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.derivation import form_of
 from lag_envs.scores import known_returns, score
@@ -567,19 +567,13 @@ def test_agents_count_the_steps_of_each_episode():
 @pytest.mark.slow
 def test_the_adaptive_controller_finds_the_bar():
     task = make_task(pivoted_bar.SwingUpUnknown.id)
-    agent, memory = AdaptiveEnergyShapingLQR(task, designs=4), None
-    envs = gym.make_vec(task.id, num_envs=64)
-    observation, _ = envs.reset(seed=0)
-    total = np.zeros(64)
-    for _ in range(500):
-        action, memory = agent.predict(observation, memory)
-        observation, reward, *_ = envs.step(action)
-        total += reward
-    assert total.mean() > 380.0
-    length = envs.unwrapped.parameters["com_distance"]  # of a uniform bar, so that q = 3/(4 L)
-    q, _ = np.linalg.solve(memory.information, memory.weighed[..., None])[..., 0].T
+    agent = AdaptiveEnergyShapingLQR(task, designs=4)
+    rollout = Rollout(task.id, agent, range(64))
+    assert rollout.run().mean() > 380.0
+    length = rollout.envs.parameters["com_distance"]  # of a uniform bar, so that q = 3/(4 L)
+    q, _ = np.linalg.solve(rollout.memory.information, rollout.memory.weighed[..., None])[..., 0].T
     assert np.median(np.abs(q * length / 0.75 - 1.0)) < 0.05
-    one, _ = agent.predict(observation[0])
+    one, _ = agent.predict(rollout.observation[0])
     assert one.shape == (1,)
 
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from covering import covering, every, slow
-from rollouts import actions, make
+from rollouts import Noisy, actions, make
 
 from lag_envs.controllers import ILQR, build, make_controller
 from lag_envs.controllers.basic import Constant, ObservationDecoder
@@ -317,19 +317,6 @@ def test_between_the_steps_of_a_plan_feedback_acts_on_the_line_between_its_state
 # --- an optimum that is proved ---
 
 
-class Noisy:
-    """The optimal law with noise."""
-
-    def __init__(self, size):
-        self.own = make_controller(PendulumRegret.id, "optimal law")
-        self.rng, self.size = np.random.default_rng(0), size
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        action, state = self.own.predict(observation, state)
-        noise = self.size * self.rng.normal(size=action.shape)
-        return np.clip(action + noise, -1.0, 1.0).astype(np.float32), state
-
-
 def greedy():
     return LookAhead(
         make_task(PendulumRegret.id), lambda ends, goals, before: np.zeros(len(ends)), np.linspace(-1, 1, 21)
@@ -342,8 +329,8 @@ POLICIES = {
     "random": lambda: make_controller(PendulumRegret.id, "random"),
     "zero": lambda: make_controller(PendulumRegret.id, "zero"),
     "push": lambda: Constant(1.0),
-    "a little noise": lambda: Noisy(0.05),
-    "noise": lambda: Noisy(0.5),
+    "a little noise": lambda: Noisy(make_controller(PendulumRegret.id, "optimal law"), 0.05),
+    "noise": lambda: Noisy(make_controller(PendulumRegret.id, "optimal law"), 0.5),
     "greedy": greedy,
 }
 
