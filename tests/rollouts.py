@@ -69,17 +69,19 @@ def nothing(env):
 
 def one_by_one(env_id, agent, seeds, **options):
     """Return an agent's returns in single environments, one episode after the other."""
-    returns = []
     with gym.make(env_id, **options) as env:
-        for seed in seeds:
-            observation, _ = env.reset(seed=seed)
-            memory, over, total, start = None, False, 0.0, np.ones(1, np.bool_)
-            while not over:
-                action, memory = agent.predict(observation, memory, start, deterministic=True)
-                observation, reward, terminated, truncated, _ = env.step(action)
-                total, over, start = total + reward, terminated or truncated, np.zeros(1, np.bool_)
-            returns.append(total)
-    return np.array(returns)
+        return np.array([episode(env, agent, seed=seed)[0] for seed in seeds])
+
+
+def episode(env, agent, **begin):
+    """Play an episode from `env.reset(**begin)`; return its return, and whether it was terminated."""
+    observation, _ = env.reset(**begin)
+    memory, over, total, start = None, False, 0.0, np.ones(1, np.bool_)
+    while not over:
+        action, memory = agent.predict(observation, memory, start, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, over, start = total + reward, terminated or truncated, np.zeros(1, np.bool_)
+    return total, terminated
 
 
 class Noisy:

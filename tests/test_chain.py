@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from covering import slow
+from rollouts import episode
 
 from agents import optimum, plans
 from lag_envs.controllers import build, make_controller
@@ -31,13 +32,8 @@ SEEDS = range(3_600_000_000, 3_600_000_050)
 
 def returns_from(kind, state, agent):
     """Return an agent's return from a start, with no step of the episode left out."""
-    env, memory, total, over = gym.make(kind.id), None, 0.0, False
-    observation, _ = env.reset(seed=0, options={"state": state})
-    while not over:
-        action, memory = agent.predict(observation, memory)
-        observation, reward, terminated, over, _ = env.step(action)
-        total += reward
-        assert not terminated
+    total, terminated = episode(gym.make(kind.id), agent, seed=0, options={"state": state})
+    assert not terminated
     return total
 
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from covering import covering, every, slow
-from rollouts import Noisy, actions, make
+from rollouts import Noisy, actions, episode, make
 
 from lag_envs.controllers import ILQR, build, make_controller
 from lag_envs.controllers.basic import Constant, ObservationDecoder
@@ -106,11 +106,7 @@ def test_spinning_does_not_pay(env_id, state, share):
     """Even if something spins from the start, which takes effort to reach."""
     options = {"duration": 2.0} | ({"damping": 0.0} if env_id == RotarySwingUp.id else {})
     env = make(env_id, **options)
-    env.reset(seed=0, options={"state": state})
-    total, over = 0.0, False
-    while not over:
-        _, reward, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
-        total, over = total + reward, terminated or truncated
+    total, _ = episode(env, Constant(0.0), seed=0, options={"state": state})
     assert total * env.task.interval * env.task.steps / 2.0 < share * best(env_id)
 
 
@@ -220,11 +216,7 @@ def test_only_the_driven_joint_has_friction(kind, idle):
 @pytest.mark.parametrize("kind", [AcrobotReal, PendubotReal])
 def test_the_published_regulator_holds_the_real_pendulum(kind):
     env = make(kind.id, duration=3.0)
-    observation, _ = env.reset(seed=0, options={"state": [math.pi + 0.03, 0.0, -0.02, 0.0]})
-    agent, over = build(env.task, "LQR"), False
-    while not over:
-        action, _ = agent.predict(observation)
-        observation, _, _, over, _ = env.step(action)
+    episode(env, build(env.task, "LQR"), seed=0, options={"state": [math.pi + 0.03, 0.0, -0.02, 0.0]})
     assert bool(env.task.goal_holds([env.state])[0])
     assert np.abs(env.state - [math.pi, 0.0, 0.0, 0.0]).max() < 0.02
 
