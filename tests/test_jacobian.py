@@ -272,6 +272,40 @@ def test_what_is_multiplied_by_hardly_anything_has_its_derivatives(mass, more):
         assert number == pytest.approx(exact, rel=1e-12 if more < 1e-9 else 1e-4)
 
 
+class TurnedRod(Scene):
+    """A rod that a torque turns from rest, so that most terms of its derivatives' series are 0."""
+
+    coordinates = {"theta": "rad", "x": "m"}
+    controls = {"torque": "N m"}
+    by_cos: float = parameter(0.0, "J")
+    by_sin: float = parameter(0.0, "J")
+    by_square: float = parameter(0.0, "J")
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.theta**2 + v.x**2)
+
+    def potential(self, q, xp):
+        by_angle = self.by_cos * xp.cos(q.theta) + self.by_sin * xp.sin(q.theta)
+        return by_angle + self.by_square * xp.sin(q.theta**2)
+
+    def applied(self, q, v, u, xp):
+        return {"theta": u.torque}
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.0, 2.5])
+@pytest.mark.parametrize("dt", [0.02, 0.1, 0.5])
+def test_series_with_gaps(dt, angle):
+    """Every fourth term, or every eighth: the last ones may all be 0 although others follow."""
+    scene, torque, names = TurnedRod(), 2.0 * angle / dt**2, ["by_cos", "by_sin", "by_square"]
+    by_parameters = scene.jacobian([0.0] * 4, torque, dt, parameters=names)[2][1]
+    backwards = scene.vjp([0.0] * 4, torque, dt, [0.0, 1.0, 0.0, 0.0], parameters=names)[2]
+    forces = (mpmath.sin, lambda x: -mpmath.cos(x), lambda x: -2.0 * x * mpmath.cos(x**2))
+    for i, force in enumerate(forces):
+        exact = mpmath.quad(lambda t, force=force: force(torque * t**2 / 2), mpmath.linspace(0, dt, 9))
+        assert by_parameters[i] == pytest.approx(float(exact), rel=2e-12), (names[i], "forwards")
+        assert backwards[i] == pytest.approx(float(exact), rel=2e-12), (names[i], "backwards")
+
+
 class SwingingAtwood(scenes.Scene):
     """Two masses on a rope over a pulley; one of them swings."""
 

@@ -17,7 +17,7 @@ from typing import Any
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
 from lag_envs.stepping.paired import Pair, PairTarget
-from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress
+from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, following
 from lag_envs.stepping.target import Target
 
 
@@ -156,8 +156,7 @@ class Backward(Series):
     ) -> tuple[list, list]:
         """Return cotangents before the step just expanded from those after it, see `pull`.
 
-        Before them stands an estimate of what the cotangents leave out: a fifth of what the last terms
-        contribute, and less of the last but one, since there may be only odd or only even terms.
+        Before them stands an estimate of what the cotangents leave out, see `following`.
         """
         both: Any = PairTarget(t, self.slots, self._bar_slots)
         found = self._sweep(both, start, h, order, ends)
@@ -166,23 +165,19 @@ class Backward(Series):
     def _sweep(self, t: Any, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list[Pair]:
         """Return cotangents before the step, and what their last terms contribute."""
         zero = t.number(0.0)
-
-        def weight(k: Any) -> Any:
-            """Return by how much a term of order k counts in the estimate."""
-            last, but_one = (t.below(t.minus(order, k), t.index(i)) for i in (1, 2))
-            return t.select(last, t.number(0.2), t.select(but_one, t.number(0.02), zero))
-
+        first, per_order = following(t, order)
         self._clear(t, order)
         n = self.size
 
-        def seed(k: Any, carried: Sequence) -> list:
+        def seed(m: Any, carried: Sequence) -> list:
+            k, (weight,) = t.minus(order, m), carried
             per = t.mul(h, t.reciprocal(t.plus(k, 1)))
             for i in range(n):
                 bar = t.fma(per, ends[i], ends[n + i])
-                t.store(self._bar("v", i), k, Pair(bar, t.mul(weight(k), bar)))
-            return []
+                t.store(self._bar("v", i), k, Pair(bar, t.mul(weight, bar)))
+            return [t.mul(weight, per_order)]
 
-        t.loop(t.index(0), t.plus(order, 1), [], seed)
+        t.loop(t.index(0), t.plus(order, 1), [first], seed)
         ends = [Pair(end, zero) for end in ends]
 
         def back(m: Any, carried: Sequence) -> list:

@@ -29,7 +29,7 @@ from lag_envs.stepping.rows import Rows
 from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE
 
 #: How many terms more the series of derivatives has.
-FURTHER = 2
+FURTHER = 1
 
 
 class SeriesStepper:

@@ -33,7 +33,7 @@ from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.dual import DualTarget
 from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.series import STRIDE, Series, StepProgress
+from lag_envs.stepping.series import STRIDE, Series, StepProgress, following
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
@@ -481,20 +481,14 @@ def _write_tangent(
             total = wide.select(wide.less(total, wide.abs(x)), wide.abs(x), total)
         return total
 
-    def terms(first: int) -> Any:
-        """Return the size of two neighbouring terms; there may be only odd or only even ones."""
-        orders = plain.plus(order, first), plain.plus(order, first - 1)
-        return largest(
-            [wide.add(*(wide.abs(wide.load(step.slot_of["v", i], k)) for k in orders)) for i in range(n)],
-            1e-300,
-        )
+    first, per_order = following(wide, order)
 
-    # What follows the last terms, if it shrinks like these.
-    last = terms(0)
-    shrinking = wide.div(last, terms(-2))
-    most = wide.number(0.9)
-    shrinking = wide.select(wide.less(shrinking, most), shrinking, most)
-    rest = wide.div(wide.mul(last, shrinking), wide.sub(wide.number(1.0), shrinking))
+    def weigh(k: Any, carried: Sequence) -> list:
+        terms = (wide.abs(wide.load(step.slot_of["v", i], k)) for i in range(n))
+        return [wide.fma(total, per_order, x) for total, x in zip(carried, terms, strict=True)]
+
+    weighed = plain.loop(plain.index(0), plain.plus(order, 1), [wide.number(0.0)] * n, weigh)
+    rest = wide.mul(first, largest(weighed, 0.0))
     size = largest([x for x in columns_of if x is not None], 1e-280)
     builder.store(rest, slopes(2 * n)).align = 8
     builder.store(size, slopes(2 * n + 1)).align = 8

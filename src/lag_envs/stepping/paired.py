@@ -1,4 +1,4 @@
-"""Two cotangents taken backwards side by side: what a step's series gives, and what its last terms do.
+"""Two cotangents taken backwards side by side: what a step's series gives, and an estimate of the rest.
 
 Going backwards is linear in cotangents, and coefficients of series are the same for both. `PairTarget` makes
 a target of such pairs from a plain one. So the recurrences are written once, and both load each coefficient
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 
 class Pair(NamedTuple):
-    """A cotangent, and the share of the last terms in it."""
+    """A cotangent, and what its terms tell of those that are left out, see `following`."""
 
     whole: Any
     last: Any
