@@ -256,6 +256,25 @@ def test_refusal_after_a_kick_that_is_no_number(kind):
         env.step(env.action_space.sample())
 
 
+@pytest.mark.parametrize("kind", [own_tasks.Deliver, pivoted_bar.SwingUp])
+@pytest.mark.parametrize("imperfections", [{}, {"lag": 0.05}])
+def test_refusal_after_a_guard_that_is_no_number(kind, imperfections):
+    def guard(self, wanted, before, dt, xp):
+        name = self.scene.control_names[-1]
+        return {name: wanted[name] + xp.log(before[0])}
+
+    torn = {"id": "OwnTornGuard-v0", "guard": guard, "terminated": Task.terminated}
+    vec = gym.make_vec(lag_envs.register(type("Torn", (kind,), torn)), num_envs=3, **imperfections)
+    vec.reset(seed=0)
+    state = vec.unwrapped.state
+    state[:, 0] = 0.1, -0.1, 0.2
+    vec.reset(options={"state": state})
+    message = "the step of environment 1 .*=nan .* the control is not finite; if the task has a guard"
+    with pytest.raises(StepRefused, match=message) as refusal:
+        vec.step(np.zeros(vec.action_space.shape, np.float32))
+    assert np.isfinite(refusal.value.results[1][[0, 2]]).all()
+
+
 @pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
 @pytest.mark.parametrize("id", IDS)
 def test_copies_go_on_alike(id, dump):

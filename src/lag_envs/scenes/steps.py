@@ -333,6 +333,8 @@ def refusal(
     remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
     if not np.isfinite(state).all():
         why, remedy = "the state is not finite", "reset the episode; if the task has a kick, look there"
+    elif not np.isfinite(values).all():
+        why, remedy = "the control is not finite", "if the task has a guard, look there"
     elif form_of(scene) is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
         remedy = "take a smaller dt or milder parameters"
