@@ -146,7 +146,7 @@ class Model:
         if formulas.clipped:
             action = np.clip(action, -formulas.largest, formulas.largest)
         y = lifted(form_of(self.task.scene), state, np)
-        return [float(u) for u in formulas.control(np, action, y, target, self._constants)]
+        return [float(u) for u in formulas.control(np, [*action], y, [*target], self._constants)]
 
     def _checked(
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None
