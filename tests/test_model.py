@@ -68,7 +68,7 @@ def test_a_refusal_names_the_applied_control():
         action = {"f": (0.0, 50.0)}
 
         def guard(self, wanted, before, dt, xp):
-            return {"f": wanted.f + before.x}
+            return {"f": wanted.f - xp.sqrt(3.0 - before.x)}
 
         def observe(self, after, target, xp):
             return {"x": after.x}
@@ -77,9 +77,17 @@ def test_a_refusal_names_the_applied_control():
             return after.x
 
     model = Model(Climb())
-    for action, control in ((0.5, 36.5), (7.0, 49.0)):
+    for action, control in ((0.5, 35.5), (7.0, 48.0)):
         with pytest.raises(StepRefused, match=rf"the step of row 1 .* with f={control:g} and dt=0.02 s"):
             model([[1.0, 0.0], [-1.0, 0.0]], [0.0, action])
+    states, message = (
+        [[1.0, 0.0], [4.0, 0.0]],
+        "the step of row 1 .* with f=nan .* if the task has a guard, look",
+    )
+    with pytest.raises(StepRefused, match=message):
+        model(states, [0.0, 0.0])
+    with pytest.raises(StepRefused, match=message):
+        model.vjp(states, [0.0, 0.0], by_states=1.0, ends=states)
 
 
 def test_bad_input_is_named():

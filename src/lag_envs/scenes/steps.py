@@ -249,7 +249,7 @@ def _check_refused(
         row, held = i if rows is None else rows[i], controls[i][None] if scene.control_names else 1
         try:
             scene.simulate(states[i], held, dt)
-        except StepRefused:
+        except (StepRefused, ValueError):  # the latter for a control that is not finite, from a guard
             raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {row}") from None
         raise StepRefused(
             f"the step of row {row} can be taken, but its derivatives cannot be found: they need more than "
