@@ -7,7 +7,6 @@ learned policies that are verified on the board. It writes ``agents/results/beha
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -15,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from agents.learners import LEARNERS, learner_label
-from agents.results import ROOT, results_json
+from agents.report import stored
+from agents.results import ROOT, write_envs
 from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.submit import AUTHORS
 from lag_envs import TASKS
@@ -25,7 +25,6 @@ from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.submission import load
 from lag_envs.options import module_parser
-from lag_envs.store import write_file
 
 BOARD, OUTPUT = ROOT / "leaderboard", ROOT / "agents" / "results" / "behaviour.json"
 EPISODES = 1_000
@@ -104,17 +103,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or [env_id for env_id, task in TASKS.items() if task.goal]
-    found: dict[str, Any] = {}
-    if args.env and OUTPUT.exists():
-        found = json.loads(OUTPUT.read_text(encoding="utf-8"))["envs"]
+    found = stored(OUTPUT).get("envs", {}) if args.env else {}
+    about = {"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED}
     for env_id in envs:
         found[env_id] = rounded_data(behaviour_of(env_id))
         for name, measures in found[env_id].items():
             lines = (f"{key}: {values}" for key, values in measures.items())
             print(env_id, name, *lines, sep="\n  ", flush=True)
-        in_order = {name: found[name] for name in TASKS if name in found}
-        about = {"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED}
-        write_file(OUTPUT, results_json(about | {"envs": in_order}))
+        write_envs(OUTPUT, about, found)
     return 0
 
 

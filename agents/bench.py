@@ -15,17 +15,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.results import results_json
-from agents.run import UserError, reports_errors
+from agents.report import rate_cells
+from agents.run import check_numbers, reports_errors
 from lag_envs.benchmark.actions import random_actions
-from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import batch
 from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import Contestant, Run, measure_rates
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import ONE_THREAD, machine
 from lag_envs.options import module_parser, new_file
-from lag_envs.store import write_file
+from lag_envs.store import readable_json, write_file
 from lag_envs.tables import aligned
 
 ENV = "PivotedBar-v0"
@@ -49,8 +48,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     args = parser().parse_args(arguments)
-    if args.rounds < 1:
-        raise UserError(f"--rounds must be at least 1, got {args.rounds}")
+    check_numbers(args, rounds=1)
     os.environ.update(ONE_THREAD)
     kinds = {"adapter": make_adapter, "DummyVecEnv": dummy}
     steps = [
@@ -62,10 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [
         rates_and_ratio(adapter, dummy) for adapter, dummy in zip(*[iter(steps + learn)] * 2, strict=True)
     ]
-    print("\n".join(table_lines(rows)))
+    head = ("", "environments", "adapter", "DummyVecEnv", "ratio")
+    print("\n".join(aligned([head, *map(rate_cells, rows)])))
     if args.output:
         about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
-        write_file(args.output, results_json(about | {"env": ENV, "rows": rounded_data(rows)}))
+        write_file(args.output, readable_json(about | {"env": ENV, "rows": rounded_data(rows)}))
     return 0 if complete and not any(row["problem"] for row in rows) else 1
 
 
@@ -119,18 +118,6 @@ def rates_and_ratio(adapter: Contestant, dummy: Contestant) -> dict[str, Any]:
     }  # fmt: skip
     pairs = ratios(adapter.rates, dummy.rates)
     return row | ({"ratio": quartiles(pairs)} if pairs else {})
-
-
-def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the lines of the table."""
-    cells = [("", "environments", "adapter", "DummyVecEnv", "ratio")]
-    for row in rows:
-        if row["problem"]:
-            cells.append((row["kind"], str(row["num_envs"]), row["problem"]))
-            continue
-        both = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
-        cells.append((row["kind"], str(row["num_envs"]), *both, f"{row['ratio'][1]:.1f}"))
-    return aligned(cells)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.optimum import DEFAULT_FOLDER, Solution, solvable
+from agents.optimum import DEFAULT_FOLDER, Solution, solved_for
 from agents.run import check_env, reports_errors
 from lag_envs import TASKS
 from lag_envs.options import module_parser
@@ -40,10 +40,7 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
         rows of n numbers, by the first axis. The lowest values are made equal, so that the others can be
         told apart.
     """
-    own = TASKS[env_id].value_iteration
-    assert own is not None
-    source = own.relaxed or env_id
-    problem = solvable()[source]
+    source, problem = solved_for(env_id)
     solution = Solution(source, problem.levels[0], folder, quiet=True)
     names = solution.task.scene.state_names
     axes = [

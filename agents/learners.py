@@ -218,20 +218,17 @@ def make_envs(run: Run, normalise: Any = None) -> Any:
     options = dict(hyper.get("env_kwargs", {}))
     task = make_task(run.env, **options)
     steps = task.limit
-    bins = factor = None
+    asked: dict[str, Any] = {}
     for wrapper in [*hyper.get("env_wrapper", []), *hyper.get("vec_env_wrapper", [])]:
         name, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
         if name not in WRAPPERS:
             raise UserError(f"wrapper {name} is not known here; {', '.join(WRAPPERS)} are")
         if not isinstance(arguments, dict) or list(arguments) != [WRAPPERS[name]]:
             raise UserError(f"wrapper {name} needs its argument, as in {name}: {{{WRAPPERS[name]}: ...}}")
-        (value,) = arguments.values()
-        if name == TIME_LIMIT:
-            options["max_episode_steps"], steps = value, min(steps, value)
-        elif name == DISCRETISE:
-            bins = value
-        else:
-            factor = value
+        (asked[name],) = arguments.values()
+    bins, factor = asked.get(DISCRETISE), asked.get(SCALE)
+    if TIME_LIMIT in asked:
+        options["max_episode_steps"], steps = asked[TIME_LIMIT], min(steps, asked[TIME_LIMIT])
     if steps == math.inf:
         raise UserError(f"the episodes of {run.env} have no end; give it a duration, or a TimeLimit to train")
     if bins and (task.formulas.choices or task.formulas.actions > 1):

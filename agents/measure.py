@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.analysis import Data
+from agents.optimum import RESULTS, GreedyPolicy, played
 from agents.run import (
     FIRST_FRESH_SEED,
     MODEL,
@@ -36,7 +37,6 @@ from lag_envs.leaderboard import export
 from lag_envs.leaderboard.export import exported, find
 
 AGENTS = Path(__file__).parent
-OPTIMA = AGENTS / "results" / "optimum"
 CONTROLLERS = Path(controllers.__file__).parent
 EXPORT = Path(export.__file__)
 #: Episodes of slow agents under changed conditions.
@@ -85,21 +85,11 @@ class Entrant:
 
 def no_optimum(env_id: str) -> str:
     """Return why there is no optimal policy; empty if there is one."""
-    try:
-        from agents.optimum import played
-    except ImportError:
-        return "agents.optimum is not there"
     if env_id not in played():
         return "value iteration gives no policy here"
-    if not (OPTIMA / f"{env_id}.json").exists():
+    if not (RESULTS / f"{env_id}.json").exists():
         return "not computed; `python -m agents.optimum` does"
     return ""
-
-
-def _optimal(env_id: str) -> Any:
-    from agents.optimum import GreedyPolicy
-
-    return GreedyPolicy(env_id)
 
 
 def _policy(env_id: str, folder: Path) -> Any:
@@ -218,8 +208,10 @@ class Evaluation:
         if reason := no_optimum(self.env):
             self.absent.append(f"optimal: {reason}")
         else:
-            mark = digest("optimum.py", "value_iteration.py", OPTIMA / f"{self.env}.json")
-            self.entrants.append(Entrant(self.env, "optimal", "optimal", partial(_optimal, self.env), mark))
+            mark = digest("optimum.py", "value_iteration.py", RESULTS / f"{self.env}.json")
+            self.entrants.append(
+                Entrant(self.env, "optimal", "optimal", partial(GreedyPolicy, self.env), mark)
+            )
         folders = [file.parent for file in runs.glob(f"{self.env}/*/seed*/{RESULT}")]
         first: dict[str, Entrant] = {}
         for folder in sorted(folders, key=lambda p: (p.parent.name, len(p.name), p.name)):

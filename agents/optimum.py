@@ -119,6 +119,14 @@ def solvable() -> dict[str, ValueIteration]:
     return {env_id: problem for env_id, problem in found.items() if problem and problem.axes}
 
 
+def solved_for(env_id: str) -> tuple[str, ValueIteration]:
+    """Return the id, and the problem, whose solution is that of an environment or bounds it from above."""
+    own = TASKS[env_id].value_iteration
+    assert own is not None
+    source = own.relaxed or env_id
+    return source, solvable()[source]
+
+
 def played() -> list[str]:
     """Return the ids for which value iteration gives a policy: those that are solved themselves."""
     return [env_id for env_id, problem in solvable().items() if not problem.options]
@@ -378,16 +386,13 @@ def scene_numbers(task: Task) -> dict[str, float]:
 
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
     """Solve the problems that an environment needs, and return its numbers."""
-    own = TASKS[env_id].value_iteration
-    assert own is not None
-    source = own.relaxed or env_id
-    problem = solvable()[source]
+    source, problem = solved_for(env_id)
     levels = [problem.levels[0] / 2, problem.levels[0]] if quick else list(problem.levels)
     states, targets = starts(env_id)
     grids = []
     for level in levels:
         solution = Solution(source, level, folder, new=new and source == env_id)
-        keep = list(own.keep) if own.relaxed else solution.keep
+        keep = solution.keep if source == env_id else list(TASKS[env_id].value_iteration.keep)
         value = float(solution.value(0, states[:, keep], targets).mean())
         grids.append(
             {

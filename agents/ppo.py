@@ -35,7 +35,7 @@ from torch import Tensor, nn
 import agents
 from agents.learners import LearnerSettings, trainable
 from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
-from agents.train import here, planned_runs, print_returns, report_failures, show_progress
+from agents.train import add_run_options, here, planned_runs, train_all
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
 from lag_envs.leaderboard.networks import stacked
@@ -418,14 +418,7 @@ def parser() -> argparse.ArgumentParser:
         "agents.ppo", "Train PPO, in one file of plain PyTorch, and evaluate it over fresh episodes.", EPILOG
     )
     p.add_argument("env", nargs="+", metavar="ENV", help="ids, module:ID, or FILE or FILE:Class of your own")
-    p.add_argument("--seeds", type=int, default=1, metavar="N", help="how many, in turn (default 1)")
-    p.add_argument("--first-seed", type=int, default=0, metavar="K", help="the first one (default 0)")
-    p.add_argument(
-        "--steps", type=int, metavar="N",
-        help="environment steps per seed, rounded up to whole updates (default: the task's own)",
-    )  # fmt: skip
-    p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
-    p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
+    add_run_options(p)
     group = p.add_argument_group(
         "settings (default: the task's own, which `lag-envs hyperparams fast_ppo` prints)"
     )
@@ -455,16 +448,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runs = planned_runs(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
         Settings.of(run.hyperparameters)  # fail now, not after another seed has been trained
-    todo = [run for run in runs if run.load_result() is None]
-    failed, stopped = show_progress(todo, here) if todo else ({}, False)
-    print_returns([run for run in runs if run.name not in failed])
-    if stopped or failed:
-        return report_failures(failed, stopped, "agents.ppo", arguments)
-    print(
-        f"Since the command began, with imports, compiling, tests and evaluation: "
-        f"{time.perf_counter() - agents.STARTED:.1f} s, {time.process_time():.1f} s of them on the processor"
-    )
-    return 0
+    status = train_all(runs, here, "agents.ppo", arguments)
+    if status == 0:
+        print(
+            f"Since the command began, with imports, compiling, tests and evaluation: "
+            f"{time.perf_counter() - agents.STARTED:.1f} s, {time.process_time():.1f} s of them on the "
+            "processor"
+        )
+    return status
 
 
 if __name__ == "__main__":

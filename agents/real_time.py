@@ -8,7 +8,6 @@ is measured by the returns with and without it in other, equal episodes. `docs/a
 from __future__ import annotations
 
 import datetime
-import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -19,7 +18,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.results import ROOT, results_json
+from agents.report import stored
+from agents.results import ROOT, write_envs
 from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import ILQR, build
@@ -27,7 +27,6 @@ from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import mean_and_error, rounded_data
 from lag_envs.host import machine
 from lag_envs.options import module_parser
-from lag_envs.store import write_file
 
 OUTPUT = ROOT / "agents" / "results" / "real_time.json"
 CLOCKED, EPISODES = 3, 64
@@ -133,9 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(args, name) < least:
             raise UserError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     envs = [check_env(name) for name in args.env] or list(TASKS)
-    found: dict[str, Any] = {}
-    if args.env and args.output.exists():
-        found = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
+    found = stored(args.output).get("envs", {}) if args.env else {}
+    about = {"date": datetime.date.today().isoformat(), "machine": machine(), "clocked": args.clocked}
+    about |= {"episodes": args.episodes, "first_seed": FIRST_FRESH_SEED}
     for env_id in envs:
         rows = {}
         for name in planning(env_id):
@@ -143,10 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(line(env_id, name, rows[name]), flush=True)
         if rows:
             found[env_id] = rows
-        in_order = {name: found[name] for name in TASKS if name in found}
-        about = {"date": datetime.date.today().isoformat(), "machine": machine(), "clocked": args.clocked}
-        about |= {"episodes": args.episodes, "first_seed": FIRST_FRESH_SEED}
-        write_file(args.output, results_json(about | {"envs": in_order}))
+        write_envs(args.output, about, found)
     return 0
 
 

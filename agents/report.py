@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from agents.analysis import LEVELS, Data
 from agents.learners import learner_label
@@ -54,7 +55,8 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         parts += [_range(env_id, env), *_optimum(env_id)]
         parts += [_env_table(env, data["episodes"]), *_times(env), *_behaviour(env_id)]
         parts += _real_time(env_id)
-        parts += [_problems(env)] if env.get("problems") else []
+        if env.get("problems"):
+            parts.append("Left out:\n\n" + "\n".join(f"- {problem}" for problem in env["problems"]))
         parts.append(
             _image(f"agents-robustness-{env_id}.png", f"{env_id}: every agent under every condition")
         )
@@ -206,13 +208,16 @@ def brief(name: str, agent: Data) -> str:
     return f"{learner_label(name)} {len(agent['seeds'])} × {agent['steps'] / 1000.0:.0f}k"
 
 
+def stored(file: Path) -> Data:
+    """Return what a command has measured; nothing if it has not been run."""
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+
+
 def _behaviour(env_id: str) -> list[str]:
     """Return the measurements of `python -m agents.behaviour`."""
-    if not BEHAVIOUR.exists():
-        return []
-    found = json.loads(BEHAVIOUR.read_text(encoding="utf-8"))
-    agents = found["envs"].get(env_id)
-    if not agents or not any(agents.values()):
+    found = stored(BEHAVIOUR)
+    agents = found.get("envs", {}).get(env_id, {})
+    if not any(agents.values()):
         return []
 
     def cell(values: Sequence[float | None]) -> str:
@@ -240,11 +245,8 @@ def _behaviour(env_id: str) -> list[str]:
 
 def _real_time(env_id: str) -> list[str]:
     """Return the measurements of `python -m agents.real_time`."""
-    if not REAL_TIME.exists():
-        return []
-    found = json.loads(REAL_TIME.read_text(encoding="utf-8"))
-    told = []
-    for name, row in found["envs"].get(env_id, {}).items():
+    found, told = stored(REAL_TIME), []
+    for name, row in found.get("envs", {}).get(env_id, {}).items():
         ms = {what: f"{1e3 * row[what]:.3g} ms" for what in ("interval", "median", "p99", "longest")}
         late = f"{row['late']:.2%}" if row["late"] else "none"
         text = (
@@ -262,10 +264,6 @@ def _real_time(env_id: str) -> list[str]:
     return ["**In real time** (`python -m agents.real_time`). " + " ".join(told)] if told else []
 
 
-def _problems(env: Data) -> str:
-    return "Left out:\n\n" + "\n".join(f"- {problem}" for problem in env["problems"])
-
-
 def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
     rows = []
     for name, found in learners.items():
@@ -273,7 +271,7 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
         rows.append(
             [
                 learner_label(name),
-                with_interval({"value": found["value"], **_ends(found["interval"])}),
+                _pooled(found),
                 f"{len(found['envs'])}: {', '.join(found['envs'])}",
                 _span(len(agent["seeds"]) for agent in agents),
                 _span(agent["steps"] for agent in agents),
@@ -298,7 +296,7 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
             env_id,
             labelled(one, env["agents"][one]),
             labelled(other, env["agents"][other]),
-            with_interval({"value": found["value"], **_ends(found["interval"])}),
+            _pooled(found),
         ]
         for env_id, env in envs.items()
         for one, others in env["improvement"].items()
@@ -402,10 +400,8 @@ def _about(data: Data) -> str:
 
 def _optimum(env_id: str) -> list[str]:
     """Return the results of `python -m agents.optimum`, with its picture."""
-    file = OPTIMA / f"{env_id}.json"
-    if not file.exists():
+    if not (found := stored(OPTIMA / f"{env_id}.json")):
         return []
-    found = json.loads(file.read_text(encoding="utf-8"))
     bound, estimate, lower = found["bound"], found["estimate"], found["lower"]
     easier = "" if lower is not None else f" of {found['solved']}, which is easier,"
     if bound["exact"]:
@@ -440,21 +436,28 @@ def _optimum(env_id: str) -> list[str]:
 def adapter_rates() -> str:
     """Return the measurements of our `VecEnv` by `python -m agents.bench`."""
     found = json.loads(ADAPTER.read_text(encoding="utf-8"))
-    rows = []
-    for row in found["rows"]:
-        adapter, dummy = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
-        rows.append([row["kind"], str(row["num_envs"]), adapter, dummy, f"{row['ratio'][1]:.1f}"])
     text = (
         "`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single environments:"
         f" {found['env']}, steps per second on one core of {found['machine']['processor']}, {found['date']};"
         f" medians of {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes most of"
         " the time."
     )
-    return text + "\n\n" + markdown_table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
+    head = ["what", "environments", "adapter", "DummyVecEnv", "ratio"]
+    return text + "\n\n" + markdown_table(head, map(rate_cells, found["rows"]))
 
 
-def _ends(interval: Sequence[float] | None) -> Data:
-    return dict(zip(("low", "high"), interval or (math.nan, math.nan), strict=True))
+def rate_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the cells of a row of `agents.bench`: both medians and their ratio, or why there are none."""
+    first = row["kind"], str(row["num_envs"])
+    if row["problem"]:
+        return *first, row["problem"]
+    return *first, *(short(quartiles(row[n])[1]) for n in ("adapter", "dummy")), f"{row['ratio'][1]:.1f}"
+
+
+def _pooled(found: Data) -> str:
+    """Return a value over several runs with its interval, if it has one."""
+    low, high = found["interval"] or (None, None)
+    return with_interval({"value": found["value"], "low": low, "high": high})
 
 
 def _image(file: str, text: str) -> str:

@@ -8,20 +8,19 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from agents.analysis import Data, best_first, chances_of_improvement, summarise_env, summarise_learners
 from agents.measure import Evaluation, MeasurementJob, measure_policies
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, check_numbers, reports_errors
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import installed_versions, machine
 from lag_envs.options import module_parser
 from lag_envs.scores import known_returns
-from lag_envs.store import write_file
+from lag_envs.store import readable_json, write_file
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
@@ -83,14 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes = usual if args.episodes is None else args.episodes
         if not 1 <= episodes <= 1_000_000:
             raise UserError(f"--episodes must lie between 1 and 1000000, got {episodes}")
-        if args.changed is not None and args.changed < 1:
-            raise UserError(f"--changed must be at least 1, got {args.changed}")
+        check_numbers(args, changed=1)
         if not args.new:
             load_summary(output)  # fail now, not after everything has been measured
         found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
         # Only now: another command may have written it meanwhile.
         data = summarise_results(found, usual, {} if args.new else load_summary(output))
-        write_file(output / SUMMARY, results_json(data))
+        write_file(output / SUMMARY, readable_json(data))
         show(data, output)
         broken = [problem for evaluation, _ in found for problem in evaluation.broken]
         for problem in broken:
@@ -166,10 +164,10 @@ def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[MeasurementJob],
     return found
 
 
-def results_json(data: Data) -> str:
-    """Return data as JSON, with lists of numbers on a line."""
-    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
-    return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+def write_envs(file: Path, about: Data, envs: Data) -> None:
+    """Write results by environment, in the order of the tasks, below what they have in common."""
+    in_order = {name: envs[name] for name in TASKS if name in envs}
+    write_file(file, readable_json(about | {"envs": in_order}))
 
 
 def load_summary(output: Path, needed: bool = False) -> Data:

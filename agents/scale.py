@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from agents.learners import learner_label
 from agents.measure import Entrant, learned_policy
 from agents.optimum import GreedyPolicy, played
-from agents.results import ROOT, results_json
-from agents.run import RESULT, UserError, check_env, read_result, reports_errors
+from agents.results import ROOT, write_envs
+from agents.run import RESULT, UserError, check_env, check_numbers, read_result, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
@@ -34,7 +34,6 @@ from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
 from lag_envs.leaderboard.shipped import load, shipped
 from lag_envs.options import module_parser, new_file
-from lag_envs.store import write_file
 from lag_envs.tasks import resolve
 from lag_envs.tasks.measured import measured_entry as of_package
 
@@ -74,9 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("--output", type=new_file, metavar="FILE", help="add the numbers to this JSON file")
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or list(TASKS)
-    for name in ("batches", "planned"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name} must be at least 1, got {getattr(args, name)}")
+    check_numbers(args, batches=1, planned=1)
     if not 1 <= args.size <= BATCH:
         raise UserError(f"--size must lie between 1 and {BATCH}, got {args.size}")
     kept: dict[str, Any] = {}
@@ -94,10 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if args.output:
             about = {"command": "python -m agents.scale", "date": datetime.date.today().isoformat()}
-            about["machine"] = machine()
             seeds = {"first_seed": FIRST_SEED, "first_seed_of_references": REFERENCE_SEED}
-            in_order = {name: kept[name] for name in TASKS if name in kept}
-            write_file(args.output, results_json(about | seeds | {"envs": in_order}))
+            write_envs(args.output, about | {"machine": machine()} | seeds, kept)
     return 0
 
 

@@ -84,22 +84,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(LEARNERS)} (default ppo)"
     )
-    p.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds (default %(default)s)")
-    p.add_argument(
-        "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
-    )
-    p.add_argument(
-        "--steps", type=int,
-        help="environment steps per seed, in place of n_timesteps; rounded up to whole updates",
-    )  # fmt: skip
+    add_run_options(p)
     p.add_argument(
         "--jobs", type=int, metavar="N", help="seeds trained at once (default: the number of cores)"
     )
     p.add_argument(
         "--config", type=Path, metavar="FILE", help="other hyperparameters, a YAML file of the Zoo"
     )
-    p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default %(default)s")
-    p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
     p.add_argument(
         "--ray",
         metavar="ADDRESS",
@@ -108,21 +99,42 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+def add_run_options(p: argparse.ArgumentParser) -> None:
+    """Add the options that the command of a single learner has too."""
+    p.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds (default %(default)s)")
+    p.add_argument(
+        "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
+    )
+    p.add_argument(
+        "--steps", type=int,
+        help="environment steps per seed, in place of n_timesteps; rounded up to whole updates",
+    )  # fmt: skip
+    p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default %(default)s")
+    p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
+
+
 @reports_errors("agents.train")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a seed failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
     runs = planned_runs(args)
-    todo = [run for run in runs if run.load_result() is None]
     for run in runs:
-        if run not in todo:
+        if run.load_result() is not None:
             print(f"{run.name}: finished before")
     parallel_map = (
         partial(on_ray, address=args.ray) if args.ray else partial(train_in_processes, jobs=args.jobs)
     )
+    return train_all(runs, parallel_map, "agents.train", arguments)
+
+
+def train_all(
+    runs: Sequence[Run], parallel_map: Callable, module: str, arguments: Sequence[str] | None
+) -> int:
+    """Train the runs that are not finished, print all returns, and return the command's exit status."""
+    todo = [run for run in runs if run.load_result() is None]
     failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
     print_returns([run for run in runs if run.name not in failed])
-    return report_failures(failed, stopped, "agents.train", arguments)
+    return report_failures(failed, stopped, module, arguments)
 
 
 def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:

@@ -19,7 +19,7 @@ from scipy.optimize import differential_evolution
 
 from agents import learners
 from agents.learners import load_policy, zoo_hyperparameters
-from agents.results import ROOT, results_json
+from agents.results import ROOT
 from agents.run import Run, UserError, check_env, check_numbers, check_writable, reports_errors
 from lag_envs import workers
 from lag_envs.controllers import build
@@ -29,7 +29,7 @@ from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import machine
 from lag_envs.options import module_parser, new_file
 from lag_envs.scores import score
-from lag_envs.store import write_file
+from lag_envs.store import readable_json, write_file
 from lag_envs.tables import aligned
 from lag_envs.tasks import TASKS
 
@@ -148,7 +148,7 @@ def search_settings(
                 how = f"failed: {workers.died(found)}"
             else:
                 setting["runs"] = sorted([*setting["runs"], rounded_data(found)], key=lambda run: run["seed"])
-                write_file(file, results_json(data))
+                write_file(file, readable_json(data))
                 shutil.rmtree(Path(folder, f"{setting['number']}-{seed}"), ignore_errors=True)
                 how = f"return {found['return']:.2f} in {found['seconds']:.0f} s"
             print(f"setting {setting['number']}, seed {seed}: {how}", flush=True)

@@ -69,17 +69,30 @@ def nothing(env):
 
 def one_by_one(env_id, agent, seeds, **options):
     """Return an agent's returns in single environments, one episode after the other."""
-    returns = []
     with gym.make(env_id, **options) as env:
-        for seed in seeds:
-            observation, _ = env.reset(seed=seed)
-            memory, over, total, start = None, False, 0.0, np.ones(1, np.bool_)
-            while not over:
-                action, memory = agent.predict(observation, memory, start, deterministic=True)
-                observation, reward, terminated, truncated, _ = env.step(action)
-                total, over, start = total + reward, terminated or truncated, np.zeros(1, np.bool_)
-            returns.append(total)
-    return np.array(returns)
+        return np.array([episode(env, agent, seed=seed)[0] for seed in seeds])
+
+
+def episode(env, agent, **begin):
+    """Play an episode from `env.reset(**begin)`; return its return, and whether it was terminated."""
+    observation, _ = env.reset(**begin)
+    memory, over, total, start = None, False, 0.0, np.ones(1, np.bool_)
+    while not over:
+        action, memory = agent.predict(observation, memory, start, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, over, start = total + reward, terminated or truncated, np.zeros(1, np.bool_)
+    return total, terminated
+
+
+class Noisy:
+    """An agent, with noise on its actions."""
+
+    def __init__(self, agent, size):
+        self.agent, self.size, self.rng = agent, size, np.random.default_rng(0)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        action, state = self.agent.predict(observation, state)
+        return (action + self.size * self.rng.normal(size=action.shape)).astype(np.float32), state
 
 
 def trace(env, given):

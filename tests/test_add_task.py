@@ -12,8 +12,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from rollouts import RENDERS, actions
+from rollouts import RENDERS
 from scipy.integrate import solve_ivp
+from test_vector import assert_alike, assert_same, pair
 from toy_pendulum import Pendulum, Swing
 
 from agents import behaviour, results, scale, submit, train
@@ -86,13 +87,15 @@ def test_environment(task):
 
 
 def test_vector_is_single(task):
-    single = gym.make_vec(ID, num_envs=3, vectorization_mode="sync")
-    native = gym.make_vec(ID, num_envs=3)
-    for envs in (single, native):
-        envs.reset(seed=5)
-    for a in actions(250, 3, 2):
-        for batched, alone in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
-            np.testing.assert_array_equal(batched, alone)
+    assert_vector_is_single(ID, 250)
+
+
+def assert_vector_is_single(env_id, steps):
+    """Step the native vector environment and Gymnasium's of single ones alike."""
+    native, single = pair(env_id, 3)
+    assert type(native) is not type(single)
+    assert_same(native.reset(seed=5), single.reset(seed=5))
+    assert assert_alike(native, single, steps) > 0
 
 
 def test_controllers(task):
@@ -237,14 +240,7 @@ def test_energy_balance():
 
 
 def test_the_toy_as_an_environment(toy):
-    single = gym.make_vec(TOY, num_envs=3, vectorization_mode="sync")
-    native = gym.make_vec(TOY, num_envs=3)
-    assert type(native) is not type(single)
-    for envs in (single, native):
-        envs.reset(seed=5)
-    for a in actions(700, 3, 1):
-        for batched, alone in zip(native.step(a)[:4], single.step(a)[:4], strict=True):
-            np.testing.assert_array_equal(batched, alone)
+    assert_vector_is_single(TOY, 700)
     check_env(gym.make(TOY, damping=0.2).unwrapped, skip_render_check=not RENDERS)
     with pytest.raises(ValueError, match="length must be above 0 m, got -1 m"):
         gym.make(TOY, length=-1.0)

@@ -41,6 +41,7 @@ from lag_envs.scenes import CartPole
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import count_operations, record_block
 from lag_envs.stepping.tracing import Trace
+from lag_envs.store import readable_json
 from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
 
 ID = pivoted_bar.SwingUpFree.id
@@ -495,7 +496,7 @@ def test_checkout_takes_the_table_over(tmp_path):
         (tmp_path / name).write_text(marks)
     report = report_of([2.0, 5.99, 20.0, 1.5])
     docs.take_over(report, tmp_path)
-    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(docs.report_json(report))
+    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(readable_json(report))
     text = (tmp_path / "docs" / "speed.md").read_text()
     assert (
         f"| {ID} | 50 ns, 2.0× | 16.7 ns, **5.99×, missed** | 5 ns, 20.0× | 66.7 ns, **1.50×, missed** |"

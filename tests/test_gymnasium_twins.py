@@ -74,28 +74,19 @@ def test_steps_pay_and_end_as_gymnasiums(env_id, peer_id):
 
 
 @each_pair
-def test_one_policy_in_both(env_id, peer_id, capsys):
+def test_one_policy_in_both(env_id, peer_id):
     """A controller runs unchanged in both, with the same return."""
     agent = make_controller(env_id, TASKS[env_id].reference)
-    found = {name: energy.returns(name, agent, 40) for name in (peer_id, env_id)}
-    with capsys.disabled():
-        print()
-        for name, returns in found.items():
-            print(f"{name:20} {TASKS[env_id].reference:24} {returns.mean():8.2f} ± {error(returns):.2f}")
-    original, twin = found.values()
-    assert abs(original.mean() - twin.mean()) < 4.0 * np.hypot(error(original), error(twin)) + 1e-9
+    original, twin = (energy.returns(name, agent, 40) for name in (peer_id, env_id))
+    errors = [returns.std(ddof=1) / np.sqrt(len(returns)) for returns in (original, twin)]
+    assert abs(original.mean() - twin.mean()) < 4.0 * np.hypot(*errors) + 1e-9
     assert min(original.mean(), twin.mean()) > {"CartPole-v1": 499.0, "Pendulum-v1": -250.0}.get(
         peer_id, -120.0
     )
 
 
-def error(returns):
-    """Return the mean's standard error."""
-    return returns.std(ddof=1) / np.sqrt(len(returns))
-
-
 @pytest.mark.slow
-def test_a_policy_trained_there_runs_here(capsys):
+def test_a_policy_trained_there_runs_here():
     ppo = pytest.importorskip("stable_baselines3").PPO
     peer_id, env_id = CartPoleExact.peer, CartPoleExact.id
     model = ppo(
@@ -103,10 +94,7 @@ def test_a_policy_trained_there_runs_here(capsys):
         n_epochs=20, learning_rate=1e-3, seed=0, device="cpu",
     )  # fmt: skip
     model.learn(25_600)
-    found = {name: energy.returns(name, model, 20) for name in (peer_id, env_id)}
-    with capsys.disabled():
-        print({name: returns.mean() for name, returns in found.items()})
-    assert min(returns.mean() for returns in found.values()) > 300.0
+    assert min(energy.returns(name, model, 20).mean() for name in (peer_id, env_id)) > 300.0
 
 
 @each_pair

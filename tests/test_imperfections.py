@@ -11,6 +11,7 @@ import numpy as np
 import own_tasks
 import pytest
 from covering import slow
+from test_vector import assert_same, pair
 
 import lag_envs
 from lag_envs import replay
@@ -49,31 +50,19 @@ ALL = {
 
 def played(env_id: str, n: int, steps: int, mode: str = "NextStep", **keywords):
     """Assert that a batch equals single environments, bit for bit; return the observations."""
-    envs = gym.make_vec(env_id, num_envs=n, autoreset_mode=mode, **keywords)
-    alone = [gym.make(env_id, **keywords) for _ in range(n)]
-    seen = [envs.reset(seed=5)[0]]
-    assert np.array_equal(seen[0], [env.reset(seed=5 + i)[0] for i, env in enumerate(alone)])
-    over, space = np.zeros(n, bool), envs.single_observation_space
+    envs, sync = pair(env_id, n, mode, **keywords)
+    own, alone, seen = envs.unwrapped, [env.unwrapped for env in sync.envs], []
+    assert_same(envs.reset(seed=5), sync.reset(seed=5))
     for _ in range(steps):
         actions = envs.action_space.sample()
-        observations, rewards, terminated, truncated, infos = envs.step(actions)
-        for i, env in enumerate(alone):
-            if over[i] and mode == "NextStep":
-                mine, reward, ends = env.reset()[0], 0.0, (False, False)
-            else:
-                mine, reward, *ends, _ = env.step(actions[i])
-                if mode == "SameStep" and any(ends[:2]):
-                    assert np.array_equal(infos["final_obs"][i], mine)
-                    mine = env.reset()[0]
-            assert np.array_equal(observations[i], mine) and rewards[i] == reward
-            assert (terminated[i], truncated[i]) == tuple(ends[:2])
-            assert space.contains(mine)
-        assert np.array_equal(envs.unwrapped.state, [env.unwrapped.state for env in alone])
-        assert np.array_equal(envs.unwrapped.control, [env.unwrapped.control for env in alone])
-        for name, values in envs.unwrapped.parameters.items():
-            assert np.array_equal(values, [env.unwrapped.parameters[name] for env in alone])
-        over = (terminated | truncated) if mode == "NextStep" else over
-        seen.append(observations)
+        found = envs.step(actions)
+        assert_same(found, sync.step(actions))
+        assert all(envs.single_observation_space.contains(one) for one in found[0])
+        assert np.array_equal(own.state, [env.state for env in alone])
+        assert np.array_equal(own.control, [env.control for env in alone])
+        for name, values in own.parameters.items():
+            assert np.array_equal(values, [env.parameters[name] for env in alone])
+        seen.append(found[0])
     return np.array(seen), envs
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from rollouts import one_by_one
+from rollouts import Noisy, one_by_one
 from scipy.optimize import brentq, minimize_scalar
 
 from agents import optimum
@@ -277,14 +277,11 @@ def test_agent_takes_one_observation_as_a_batch(brake):
     np.testing.assert_allclose(one, play(incline.Brake.id, brake, range(5, 8)), rtol=1e-12)
 
 
-def test_agent_counts_the_steps_of_each_episode(brake):
-    observation = np.array([[1.0, 0.5], [2.0, 0.5]])
-    _, taken = brake.predict(observation)
-    _, taken = brake.predict(observation, taken, np.array([False, True]))
-    assert taken.tolist() == [2, 1]
-    action, taken = brake.predict(observation[0], np.array([499]))  # the last step, and past the end
+def test_agent_acts_in_the_last_step_and_past_the_end(brake):
+    observation = np.array([1.0, 0.5])
+    action, taken = brake.predict(observation, np.array([499]))
     assert action.shape == (1,) and action.dtype == np.float32 and taken.tolist() == [500]
-    brake.predict(observation[0], taken)
+    brake.predict(observation, taken)
 
 
 def test_agent_is_there_for_what_is_solved():
@@ -529,26 +526,13 @@ def test_optimum_of_braking_where_the_line_is_out_of_reach():
 
 @pytest.mark.parametrize("options", [{}, {"mass": 1.2}, {"dt": 0.1}, {"tilt": 0.4}])
 def test_nothing_beats_the_optimum_of_braking(options):
-    envs = gym.make_vec(incline.Brake.id, 300, autoreset_mode="Disabled", **options)
-    rng = np.random.default_rng(0)
     names = ("switching line", "best constant", "full damping", "zero", "random")
-    agents = [make_controller(incline.Brake.id, name, **options) for name in names]
+    line, *others = (make_controller(incline.Brake.id, name, **options) for name in names)
     # And along the line, with every action changed a little to either side.
-    line = agents[0]
-    for agent in (*agents, None):
-        observation, _ = envs.reset(seed=3)
-        best = optimal_return(envs.unwrapped.task, *envs.unwrapped.state.T)
-        total, running = np.zeros(300), np.ones(300, np.bool_)
-        while running.any():
-            action = (agent or line).predict(observation)[0]
-            if agent is None:
-                action = action + rng.normal(scale=0.1, size=action.shape).astype(np.float32)
-            observation, reward, terminated, truncated, _ = envs.step(action)
-            total += np.where(running, reward, 0.0)
-            over = terminated | truncated
-            running &= ~over
-            if over.any():
-                observation, _ = envs.reset(options={"reset_mask": over})
+    for agent in (line, *others, Noisy(line, 0.1)):
+        rollout = Rollout(incline.Brake.id, agent, range(3, 303), **options)
+        best = optimal_return(rollout.task, *rollout.state.T)
+        total = rollout.run()
         assert (total <= best + 1e-9).all()
         if agent is line and not options:
             assert (best - total).max() < 4e-4
@@ -575,12 +559,6 @@ def test_no_agent_is_above_what_is_published_of_the_optimum(env_id):
 VERIFIED = sorted((ROOT / "leaderboard" / "results").glob("*.json.gz"))
 
 
-def starts_of(env_id, seed, episodes):
-    envs = gym.make_vec(env_id, episodes)
-    envs.reset(seed=seed)
-    return envs.unwrapped.task, envs.unwrapped.state
-
-
 @pytest.mark.parametrize("file", VERIFIED, ids=[file.name.partition(".")[0] for file in VERIFIED])
 def test_no_verified_result_is_above_what_is_published_of_the_optimum(file):
     """Each has its own episodes: the optimum is shifted by the reference's luck in them."""
@@ -591,8 +569,8 @@ def test_no_verified_result_is_above_what_is_published_of_the_optimum(file):
         returns = np.array(policy["returns"])
         if TASKS[env_id].optimum:
             seed = first_seed(result["digest"], result["nonce"], number)
-            task, states = starts_of(env_id, seed, len(returns))
-            assert (returns <= optimal_return(task, *states.T) + 1e-9).all()
+            start = Rollout(env_id, None, range(seed, seed + len(returns)))
+            assert (returns <= optimal_return(start.task, *start.state.T) + 1e-9).all()
             continue
         assert (returns <= numbers(env_id)["bound"]["value"]).all()
         ahead, most_ahead = returns, most

@@ -16,6 +16,7 @@ import pytest
 from covering import slow
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
+from test_vector import assert_alike, assert_same, pair
 
 import lag_envs
 from lag_envs.envs.single import LagrangianEnv
@@ -43,19 +44,9 @@ def test_gymnasium_checker(id):
 @pytest.mark.parametrize("id", [slow(IDS[0]), *IDS[1:]])
 @pytest.mark.parametrize("n", [3, slow(70)])
 def test_vector_is_single(id, n):
-    single = gym.make_vec(id, num_envs=n, vectorization_mode="sync")
-    native = gym.make_vec(id, num_envs=n)
-    native.action_space.seed(1)
-    pairs = [(native.reset(seed=5)[0], single.reset(seed=5)[0])]
-    steps = 200 if n == 3 else 30
-    ends = 0
-    for _ in range(steps):
-        action = native.action_space.sample()
-        batched, alone = native.step(action), single.step(action)
-        ends += int((batched[2] | batched[3]).sum())
-        pairs += zip(batched[:4], alone[:4], strict=True)
-    for batched, alone in pairs:
-        np.testing.assert_array_equal(batched, alone)
+    native, single = pair(id, n)
+    assert_same(native.reset(seed=5), single.reset(seed=5))
+    ends = assert_alike(native, single, 200 if n == 3 else 30)
     assert ends or n != 3
 
 

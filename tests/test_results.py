@@ -17,6 +17,7 @@ from lag_envs.evaluation.conditions import NOMINAL, OFTEN, Condition
 from lag_envs.evaluation.rollout import Episodes, Rollout, play, record_rollout
 from lag_envs.generated import replaced
 from lag_envs.scores import KnownReturns
+from lag_envs.store import readable_json
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 from tools.missing import have
 
@@ -271,7 +272,7 @@ def test_command_says_what_is_wrong(command, tmp_path):
 
 def test_page_and_figures_of_any_results(tmp_path):
     data = results.rounded_data(invented())
-    results.write_file(tmp_path / results.SUMMARY, results.results_json(data))
+    results.write_file(tmp_path / results.SUMMARY, readable_json(data))
     assert summary(tmp_path) == data
     stale = tmp_path / results.PICTURES / "agents-stale.png"
     results.write_file(stale, b"of an agent that is gone")

@@ -1,56 +1,21 @@
-"""Learners by gradients and by a controller: they learn, repeat and resume bit for bit."""
+"""Learners by gradients and by a controller; `test_ppo` has the tests of all our learners."""
 
 import copy
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from test_ppo import learnt
-from trainings import go
+from covering import slow
+from test_ppo import OTHERS
 
-from agents import cloning, learners, shac, train
-from agents.learners import load_policy, zoo_hyperparameters
-from agents.run import RESULT, Run, UserError, fresh_seeds
+from agents import cloning, shac, train
+from agents.learners import zoo_hyperparameters
+from agents.run import UserError, fresh_seeds
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import score
 from lag_envs.tasks import cart_pole, pivoted_bar
 
 FREE, TRACK = pivoted_bar.SwingUpFree.id, pivoted_bar.SwingUp.id
-#: For trainings that take a fraction of a second.
-SHORT = {
-    "shac": {"n_envs": 8, "n_steps": 16, "critic": [8]},
-    "cloning": {"n_envs": 8, "n_steps": 16, "n_updates": 2, "batch_size": 8},
-}
-each_learner = pytest.mark.parametrize("algo", SHORT)
-
-
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
-    monkeypatch.setattr(learners, "EPISODES", 5)
-    monkeypatch.setattr(learners, "TEST_EPISODES", 2)
-    monkeypatch.setattr(learners, "TESTS", 3)
-
-
-def make_run(folder, algo, seed=3):
-    return Run(Path(folder), FREE, algo, seed, 768, zoo_hyperparameters(algo, FREE) | SHORT[algo])
-
-
-@each_learner
-def test_a_seed_decides_everything_with_interruptions_or_without(algo, tmp_path):
-    whole, other, cut = (make_run(tmp_path / name, algo) for name in ("a", "b", "c"))
-    other.seed = 4
-    assert go(whole) and go(other)
-    assert not go(cut, 384)  # a window after the last checkpoint
-    cut = make_run(tmp_path / "c", algo)
-    assert cut.load_checkpoint() is not None and 0 < cut.trained <= 384
-    torch.manual_seed(0)
-    assert go(cut)
-    assert learnt(cut) == learnt(whole) != learnt(other)
-    result = json.loads(whole.path(RESULT).read_text())
-    policy = load_policy(whole.folder)
-    assert play(FREE, policy, fresh_seeds(5)).tolist() == result["evaluation"]["returns"]
 
 
 @pytest.mark.parametrize(("env_id", "share"), [(FREE, 0.5), (TRACK, 0.01)])
@@ -84,23 +49,21 @@ def test_gradients_are_slopes_of_what_is_earned(env_id, share):
     np.testing.assert_allclose(learner.gradients(w)[first, :, 0], slopes, rtol=0.02, atol=1e-5)
 
 
-def test_it_swings_the_free_bar_up():
-    """In about a second of training; back-propagation through time without bounds stays below .6."""
-    hyper = zoo_hyperparameters("shac", FREE) | {"n_timesteps": 4e5}
-    learner = shac.Learner(FREE, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
+@pytest.mark.parametrize(
+    ("env_id", "changes", "least"),
+    [
+        # In about a second of training; back-propagation through time without bounds stays below .6.
+        (FREE, {"n_timesteps": 4e5}, 0.9),
+        # For ten seconds: a policy that drifts reaches the track's end, drops the bar, and stays below .9.
+        slow(TRACK, {}, 0.97),
+    ],
+)
+def test_it_swings_the_bar_up(env_id, changes, least):
+    hyper = zoo_hyperparameters("shac", env_id) | changes
+    learner = shac.Learner(env_id, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:
         learner.iterate()
-    assert score(FREE, play(FREE, learner.policy, fresh_seeds(100)).mean()) > 0.9
-
-
-@pytest.mark.slow
-def test_it_keeps_the_bar_up_on_a_track():
-    """For ten seconds: a policy that drifts reaches the track's end, drops the bar, and stays below .9."""
-    hyper = zoo_hyperparameters("shac", TRACK)
-    learner = shac.Learner(TRACK, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
-    while learner.trained < learner.steps:
-        learner.iterate()
-    assert score(TRACK, play(TRACK, learner.policy, fresh_seeds(100)).mean()) > 0.97
+    assert score(env_id, play(env_id, learner.policy, fresh_seeds(100)).mean()) > least
 
 
 @pytest.mark.parametrize(
@@ -125,7 +88,7 @@ def test_mistakes_are_named(algo, env_id, changes, message):
 
 @pytest.mark.slow
 def test_commands_know_them(tmp_path, capsys):
-    given = [FREE, "--algo", *SHORT, "--steps", "6400", "--output", str(tmp_path)]
+    given = [FREE, "--algo", *OTHERS, "--steps", "6400", "--output", str(tmp_path)]
     assert train.main([*given, "--jobs", "1"]) == 0
     output = capsys.readouterr().out
-    assert all(f"{FREE}, {algo}, " in output for algo in SHORT)
+    assert all(f"{FREE}, {algo}, " in output for algo in OTHERS)

@@ -12,7 +12,8 @@ from mpmath import mp, mpf
 from rollouts import actions, make
 
 from lag_envs import scenes
-from lag_envs.controllers import make_controller
+from lag_envs.controllers import Constant, Random, make_controller
+from lag_envs.evaluation.rollout import play
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.registration import make_task
 
@@ -566,20 +567,6 @@ def test_the_way_to_the_line_is_paid_by_the_second():
 # --- known returns ---
 
 
-def returns(env_id, policy, n=500, **options):
-    """Return the returns of the first episodes."""
-    envs = gym.make_vec(env_id, num_envs=n, **options)
-    envs.reset(seed=0)
-    rng = np.random.default_rng(1)
-    total, on = np.zeros(n), np.ones(n, dtype=bool)
-    while on.any():
-        given = rng.uniform(-1.0, 1.0, (n, 1)) if policy is None else np.full((n, 1), policy)
-        _, rewards, terminated, truncated, _ = envs.step(given)
-        total += on * rewards
-        on &= ~(terminated | truncated)
-    return total
-
-
 @pytest.mark.parametrize(
     ("env_id", "policy", "options", "known"),
     [
@@ -604,7 +591,8 @@ def returns(env_id, policy, n=500, **options):
     ],
 )
 def test_known_returns(env_id, policy, options, known):
-    drawn = returns(env_id, policy, **options)
+    agent = Random(1) if policy is None else Constant(policy)
+    drawn = play(env_id, agent, range(500), **options)
     # The known figures are means of 20 episodes.
     assert abs(drawn.mean() - known) < 3 * drawn.std() / math.sqrt(20) + 0.05 + 0.01 * abs(known)
 

@@ -18,7 +18,7 @@ import pytest
 import yaml
 from covering import slow
 from rollouts import one_by_one
-from trainings import go, kill_and_interrupt
+from trainings import go, kill_and_interrupt, short_evaluations
 
 from agents import learners, run, train
 from agents.learners import ALGORITHMS, load_policy, zoo_hyperparameters
@@ -39,11 +39,7 @@ SHORT = {
 SHORT |= {name: SHORT["sac"] for name in ("tqc", "dqn")} | {"td3": SHORT["sac"] | {"n_steps": 3}}
 
 
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
-    monkeypatch.setattr(learners, "EPISODES", 3)
-    monkeypatch.setattr(learners, "TEST_EPISODES", 2)
-    monkeypatch.setattr(learners, "TESTS", 3)
+short = short_evaluations(3)
 
 
 def make_run(folder, algo="ppo", env_id=ENV, steps=400, **more):

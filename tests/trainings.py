@@ -6,9 +6,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from agents import learners
 
 ROOT = Path(__file__).parents[1]
+
+
+def short_evaluations(episodes):
+    """Return a fixture for a module whose trainings have few tests, and evaluations of so many episodes."""
+
+    @pytest.fixture(autouse=True)
+    def short(monkeypatch):
+        for name, number in {"EPISODES": episodes, "TEST_EPISODES": 2, "TESTS": 3}.items():
+            monkeypatch.setattr(learners, name, number)
+
+    return short
 
 
 def go(run, until=10**9):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,6 +57,12 @@ def to_disk(path: Path) -> None:
         os.fsync(file)
     finally:
         os.close(file)
+
+
+def readable_json(data: Any) -> str:
+    """Return data as JSON, with lists of numbers on a line."""
+    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+    return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def append(path: Path, row: dict[str, Any]) -> None:

@@ -409,8 +409,8 @@ def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
             "The top of the leaderboard (0 is random actions, 1 the best policy known when the protocol "
             "began):",
             markdown_table(["Rank", "Agent", "Kind", "Score", "95 % interval"], rows),
-            f"[Drive it yourself, watch the agents, and see the whole ranking](../board/{env_id}.html). [Agents](../agents.md#"
-            f"{env_id.lower()}) has their robustness and learning curves.",
+            f"[Drive it yourself, watch the agents, and see the whole ranking](../board/{env_id}.html). "
+            f"[Agents](../agents.md#{env_id.lower()}) has their robustness and learning curves.",
         ]
     elif task.goal:
         texts.append(f"Nobody is on [its board](../board/{env_id}.html) yet.")

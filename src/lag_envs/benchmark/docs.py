@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ from lag_envs.benchmark.chain_costs import Costs, cost_table, growth, write_figu
 from lag_envs.benchmark.results import times_of
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, SpeedTarget, has_own_flow, reached_targets
 from lag_envs.generated import replaced
-from lag_envs.store import write_file
+from lag_envs.store import readable_json, write_file
 from lag_envs.tables import markdown_table
 
 #: The picture of chains' costs, in docs.
@@ -21,7 +19,7 @@ CHAINS = Path("images", "chains.svg")
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
     """Write a report into a checkout: ``docs/speed.json``, and its texts in docs/speed.md and README."""
-    write_file(checkout / "docs" / "speed.json", report_json(report))
+    write_file(checkout / "docs" / "speed.json", readable_json(report))
     for path, text in texts(report, checkout).items():
         write_file(path, text)
     if costs := _with_series(report):
@@ -36,12 +34,6 @@ def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
         page: replaced(text, "fast", claim(report)),
         readme: replaced(readme.read_text(encoding="utf-8"), "fast", claim(report)),
     }
-
-
-def report_json(report: dict[str, Any]) -> str:
-    """Return a report as JSON, with lists of numbers on a line."""
-    text = json.dumps(report, indent=1, allow_nan=False)
-    return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def speed_markdown(report: dict[str, Any]) -> str:

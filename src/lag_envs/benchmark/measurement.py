@@ -13,7 +13,7 @@ from lag_envs.benchmark.chain_costs import chain_costs, chain_divisions
 from lag_envs.benchmark.console import report_lines
 from lag_envs.benchmark.contestants import contestants
 from lag_envs.benchmark.divisions import divisions
-from lag_envs.benchmark.docs import report_json, take_over
+from lag_envs.benchmark.docs import take_over
 from lag_envs.benchmark.energies import of_energies
 from lag_envs.benchmark.jacobians import backwards, jacobians
 from lag_envs.benchmark.peak import arithmetic
@@ -22,7 +22,7 @@ from lag_envs.benchmark.rounds import CLOCKS, measure_rates
 from lag_envs.benchmark.targets import verdicts
 from lag_envs.host import installed_versions, machine
 from lag_envs.own_files import registered
-from lag_envs.store import write_file
+from lag_envs.store import readable_json, write_file
 from lag_envs.tasks import TASKS
 
 LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "jax", "torchrl", "torch")
@@ -100,7 +100,7 @@ def bench(settings: BenchmarkSettings) -> dict[str, Any]:
     output = Path(settings.output) if settings.output and measured else None
     try:
         if output:
-            write_file(output, report_json(report))
+            write_file(output, readable_json(report))
     finally:
         print("\n".join(report_lines(report)))
     if output:

@@ -283,10 +283,11 @@ def check_observation(task: Task, observation: ArrayLike) -> Array:
     return values
 
 
-def check_count(name: str, number: Any, least: int = 1) -> None:
+def check_counts(least: int = 1, /, **numbers: Any) -> None:
     """Raise a ValueError for a number that is not whole, or too small."""
-    if not isinstance(number, (int, np.integer)) or number < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {number}")
+    for name, number in numbers.items():
+        if not isinstance(number, (int, np.integer)) or number < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {number}")
 
 
 def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:

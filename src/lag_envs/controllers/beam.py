@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_count, check_names
+from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_counts
 from lag_envs.controllers.mpc import without_kicks
 from lag_envs.controllers.swing_up import away
 from lag_envs.envs.model import Model
@@ -110,8 +110,7 @@ class BeamSearch:
                 "use MPC or ILQR"
             )
         every = horizon if every is None else every
-        for name, number in (("horizon", horizon), ("width", width), ("every", every), ("pause", pause)):
-            check_count(name, number)
+        check_counts(horizon=horizon, width=width, every=every, pause=pause)
         for name, size in (("cell", cell), ("surprise", surprise)):
             if not size > 0.0:
                 raise ValueError(f"{name} must be above 0, got {size}")
@@ -278,12 +277,9 @@ def beam(
     **numbers
         Keywords of `BeamSearch`.
     """
-    weights, rest = weights or {}, rest or {}
-    check_names("weights", weights, task.scene.state_names)
-    check_names("rest", rest, task.scene.state_names)
+    lost = away(task, weights or {}, rest or {})
     if not weights and not energy:
         return BeamSearch(task, **numbers)
-    lost = away(task, weights, rest)
 
     def tail(states: Array) -> Array:
         gained = energy * task.scene.energy(states)["total"] if energy else 0.0

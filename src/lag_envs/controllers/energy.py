@@ -6,12 +6,22 @@ from abc import abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.controllers.basic import Array, actions_for
 from lag_envs.controllers.linear import Regulator
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks.base import Task
+
+
+def in_charge(
+    cost: Array, before: ArrayLike | None, episode_start: ArrayLike | None, catch: float, lose: float
+) -> NDArray[np.bool_]:
+    """Return where a regulator acts: its cost to go is below `catch`, or below `lose` if it acted before."""
+    acted = np.zeros(cost.shape, np.bool_) if before is None else np.array(before, np.bool_)
+    if episode_start is not None:
+        acted &= ~np.asarray(episode_start, np.bool_).reshape(acted.shape)
+    return cost < np.where(acted, lose, catch)
 
 
 class Pumped(Regulator):
@@ -42,10 +52,7 @@ class Pumped(Regulator):
     ) -> tuple[NDArray, NDArray[np.bool_]]:
         """Return the action for each observation; the state tells where the regulator is in charge."""
         x, target = self.read(observation)
-        holds = np.zeros(x.shape[:-1], np.bool_) if state is None else np.array(state, np.bool_)
-        if episode_start is not None:
-            holds &= ~np.asarray(episode_start, np.bool_).reshape(holds.shape)
-        holds = self.cost_to_go(x) < np.where(holds, self.lose, self.catch)
+        holds = in_charge(self.cost_to_go(x), state, episode_start, self.catch, self.lose)
         return actions_for(self.task, np.where(holds, self.control(x, target), self.swing(x))), holds
 
     def law(self, task: Task) -> None:

@@ -30,19 +30,15 @@ from lag_envs.tasks.base import Task
 Array = NDArray[np.float64]
 
 
-def quadratic_cost(
-    task: Task, state: Sequence[float] | Array, control: float = 0.0, target: float = 0.0
-) -> Array:
-    """Return the matrix C of a step's loss (x, u)' C (x, u), the reward's to second order.
+def quadratic_cost(task: Task, state: Sequence[float] | Array) -> Array:
+    """Return the matrix C of a step's loss (x, u)' C (x, u), the reward's to second order about a state.
 
     Parameters
     ----------
     task : Task
-        The task.
+        The task; its target is taken as 0.
     state : sequence of float, shape (n,)
-        The equilibrium about which to expand.
-    control, target : float
-        The control there, and the target.
+        The equilibrium without control about which to expand.
     """
     scene = task.scene
     x = [sympy.Symbol(name, real=True) for name in (*scene.state_names, "u")]
@@ -52,17 +48,13 @@ def quadratic_cost(
         angle = x[form.angle]
         lifted += [sympy.cos(angle), sympy.sin(angle)]
     k = SimpleNamespace(**task.formulas.constants())
-    reward = task.formulas.reward(Symbolic, lifted, lifted, x[-1:], [target] * task.formulas.targets, k)
-    curvature = sympy.hessian(reward, x).subs(dict(zip(x, (*state, control), strict=True)))
+    reward = task.formulas.reward(Symbolic, lifted, lifted, x[-1:], [0.0] * task.formulas.targets, k)
+    curvature = sympy.hessian(reward, x).subs(dict(zip(x, (*state, 0.0), strict=True)))
     return -0.5 * np.array(curvature.tolist(), np.float64)
 
 
 def regulator(
-    task: Task,
-    state: Sequence[float] | Array,
-    control: float = 0.0,
-    target: float = 0.0,
-    extra: Mapping[str, float] | None = None,
+    task: Task, state: Sequence[float] | Array, *, extra: Mapping[str, float] | None = None
 ) -> tuple[Array, Array]:
     """Return K of δu = -K δx, shape (n,), and P of the cost to go δx'Pδx, near an equilibrium.
 
@@ -70,22 +62,27 @@ def regulator(
     ----------
     task : Task
         The task; the regulator optimises its reward to second order.
-    state, control, target : sequence of float, float, float
-        The equilibrium.
+    state : sequence of float, shape (n,)
+        The equilibrium without control, and with the target 0.
     extra : mapping of str to float, optional
         Additional costs of a step of the task's own interval: weights of the squares of states, by name, and
         of "u".
     """
     check_single_control("regulator", task)
-    c = quadratic_cost(task, state, control, target)
+    c = quadratic_cost(task, state)
     names = [*task.scene.state_names, "u"]
     check_names("extra", extra or {}, names)
     for name, weight in (extra or {}).items():
         c[names.index(name), names.index(name)] += weight * task.dt / task.interval
-    a, b = task.scene.jacobian(state, control, task.dt)
+    a, b = task.scene.jacobian(state, 0.0, task.dt)
     q, r = c[:-1, :-1], c[-1:, -1:]
     p = solve_discrete_are(a, b, q, r)
-    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)[0], p
+    return _gain(a, b, p, r)[0], p
+
+
+def _gain(a: Array, b: Array, p: Array, r: Array) -> Array:
+    """Return K of the best u = -K x, if x'Px is the cost after the step Ax + Bu and u'Ru that of u."""
+    return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), np.float64)
 
 
 def time_varying(
@@ -131,17 +128,13 @@ def time_varying(
     a, b = scene.jacobian(rest, task.wanted(np.atleast_2d(task.rest_action))[0], task.dt)
     b = b @ by_action
     p = solve_discrete_are(a, b, q, r)
-
-    def gain(a: Array, b: Array, p: Array) -> Array:
-        return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), np.float64)
-
-    hold = gain(a, b, p)
+    hold = _gain(a, b, p, r)
     gains = np.empty((len(actions), m, len(rest)))
     if len(actions):
         along, by = scene.jacobian(states[:-1], task.wanted(actions), task.dt)
     for t in range(len(actions) - 1, -1, -1):
         a, b = along[t], by[t] @ by_action
-        gains[t] = k = gain(a, b, p)
+        gains[t] = k = _gain(a, b, p, r)
         closed = a - b @ k
         p = q + k.T @ r @ k + closed.T @ p @ closed
     return (gains[:, 0], hold[0]) if m == 1 else (gains, hold)
@@ -188,7 +181,7 @@ class Regulator(FeedbackController):
         q = np.diag([weights.get(name, 0.0) for name in scene.state_names])
         r = effort * np.diag(1.0 / np.atleast_1d(task.limit_control) ** 2)
         self.cost = solve_discrete_are(a, b, q, r)
-        self.gain = np.linalg.solve(r + b.T @ self.cost @ b, b.T @ self.cost @ a)
+        self.gain = _gain(a, b, self.cost, r)
 
     def _check_rest(self, task: Task) -> None:
         """Raise a ValueError if the state does not stay at rest without control."""

@@ -15,8 +15,7 @@ from lag_envs.controllers.basic import (
     ObservationDecoder,
     beginning,
     check_continuous,
-    check_count,
-    check_names,
+    check_counts,
     remade,
 )
 from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
@@ -130,15 +129,8 @@ class MPC:
         holds: Callable[[Array], NDArray[np.bool_]] | None = None,
         seed: int = 0,
     ) -> None:
-        for name, number in (
-            ("horizon", horizon),
-            ("every", every),
-            ("guesses", guesses),
-            ("finer", finer),
-            ("budget", budget),
-        ):
-            check_count(name, number)
-        check_count("ahead", ahead, 0)
+        check_counts(horizon=horizon, every=every, guesses=guesses, finer=finer, budget=budget)
+        check_counts(0, ahead=ahead)
         if background and not ahead:
             raise ValueError("background=True needs `ahead`, the number of steps that a renewal may take")
         check_continuous("MPC", task)
@@ -391,9 +383,8 @@ def planner(
     ValueError
         For names that are not entries of the state, and a task with listed actions.
     """
-    for what, given in (("weights", weights), ("rest", rest)):
-        check_names(what, given or {}, task.scene.state_names)
-    return MPC(task, away(task, weights, rest or {}) if weights else None, **numbers)
+    lost = away(task, weights or {}, rest or {})
+    return MPC(task, lost if weights else None, **numbers)
 
 
 def loss(task: Task) -> Callable[[Array], Array]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
+from lag_envs.controllers.energy import in_charge
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.pivoted_bar import SwingUp
@@ -70,11 +71,7 @@ class EnergyShapingLQR:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return the action for each observation; the state tells where the LQR is in charge."""
         x, _ = self.read(observation)
-        holds = np.zeros(x.shape[:-1], np.bool_) if state is None else np.array(state, np.bool_)
-        if episode_start is not None:
-            holds &= ~np.asarray(episode_start, np.bool_).reshape(holds.shape)
-        cost = self.cost_to_go(x)
-        holds = cost < np.where(holds, self.lose, self.catch)
+        holds = in_charge(self.cost_to_go(x), state, episode_start, self.catch, self.lose)
         u = np.where(holds, -from_upright(x) @ self.gain, self.swing(x))
         return as_actions(self.task.formulas.action(u)), holds
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array, remade
+from lag_envs.controllers.basic import Array, check_names, remade
 from lag_envs.tasks.base import Task
 
 
@@ -77,8 +77,15 @@ def away(task: Task, weights: Mapping[str, float], rest: Mapping[str, float]) ->
         minus its cosine.
     rest : mapping
         The entries at rest; 0 if not given.
+
+    Raises
+    ------
+    ValueError
+        For names that are not entries of the state.
     """
     names, units = task.scene.state_names, task.scene.state_units
+    check_names("weights", weights, names)
+    check_names("rest", rest, names)
 
     def lost(states: Array) -> Array:
         total = np.zeros(len(states))

@@ -170,37 +170,34 @@ class Task:
     def __init__(
         self, *, dt: float | None = None, duration: float | None = None, target: Any = None, **parameters: Any
     ) -> None:
+        of = type(self).__name__
         if hasattr(type(self), "scene_type"):
             raise FormulaError(
-                f"{type(self).__name__} is written for lag_envs 0.1, with scene_type and formulas by index; "
+                f"{of} is written for lag_envs 0.1, with scene_type and formulas by index; "
                 "write scene, action, start, observe and reward by name (see CHANGELOG.md)"
             )
         if type(self).shapes is not Task.shapes:
-            raise FormulaError(f"{type(self).__name__}.shapes: {picture.INSTEAD_OF_SHAPES}")
+            raise FormulaError(f"{of}.shapes: {picture.INSTEAD_OF_SHAPES}")
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
-            raise FormulaError(
-                f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}"
-            )
+            raise FormulaError(f"{of}.scene must be a class derived from Scene, got {kind!r:.60}")
         asked = {name: parameters.pop(name) for name in KEYWORDS if name in parameters}
         known = list(inspect.signature(kind).parameters)
         for name in known:
             if name in _reserved():
                 raise FormulaError(
-                    f"{type(self).__name__}.scene: the field {name!r} of {kind.__name__} has the name of a "
+                    f"{of}.scene: the field {name!r} of {kind.__name__} has the name of a "
                     "keyword of environments, so it could not be set; rename the field"
                 )
         for mapping in ("defaults", "usable"):
             for name in sorted(set(getattr(self, mapping)) - set(known)):
                 raise FormulaError(
-                    f"{type(self).__name__}.{mapping}: {kind.__name__} has no parameter {name!r}; "
-                    f"{hint(name, known)}"
+                    f"{of}.{mapping}: {kind.__name__} has no parameter {name!r}; {hint(name, known)}"
                 )
         for name, pair in self.usable.items():
             if not (isinstance(pair, Sequence) and len(pair) == 2 and pair[0] <= pair[1]):
                 raise FormulaError(
-                    f"{type(self).__name__}.usable[{name!r}] must be (lowest, highest), in this order, "
-                    f"got {pair!r:.60}"
+                    f"{of}.usable[{name!r}] must be (lowest, highest), in this order, got {pair!r:.60}"
                 )
         for name in sorted(set(parameters) - set(known)):
             target = ["target"] if type(self).target else []
@@ -215,8 +212,7 @@ class Task:
         self.given = dict(self.defaults) | parameters
         self.scene = kind(**self.given)
         if self.order is not None:
-            vars(self.scene)[ORDER] = check_order(f"{type(self).__name__}.order", self.order)
-        of = type(self).__name__
+            vars(self.scene)[ORDER] = check_order(f"{of}.order", self.order)
         interval = check_number(f"{of}.interval", self.interval, "s")
         self.dt = interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:

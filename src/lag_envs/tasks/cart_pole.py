@@ -28,7 +28,6 @@ class _OnTrack(Task):
     interval, steps = 0.02, 500
     order = 10  # the pole is slow: 16 takes half as long again, 8 nearly twice as long
     track = 2.4  # half length [m]
-    highest = math.radians(12.0)  # [rad]
 
     def bodies(self) -> Bodies:
         """Add the upright pole, and the ends of the track."""
@@ -51,7 +50,27 @@ class _OnTrack(Task):
         return xp.abs(after.x) > self.track
 
 
-class CartPoleExact(_OnTrack):
+class _Balance(_OnTrack):
+    """What the tasks share in which the pole stands at first, and must not fall."""
+
+    highest = math.radians(12.0)  # [rad]
+    examples = Examples(
+        start={"state": [0.1, -0.2, 0.05, 0.1]},
+        moving=[0.5, 2.0, 0.1, -3.0],
+        refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
+        ending=([2.39, 2.0, 0.0, 0.0], 1),
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
+    )
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Return whether the cart has left its track, or the pole leans by more than 12 degrees."""
+        return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
+
+
+class CartPoleExact(_Balance):
     """Balance a pole on a cart with pushes to the left or right: Gymnasium's CartPole-v1, stepped exactly.
 
     ## Description
@@ -145,16 +164,6 @@ class CartPoleExact(_OnTrack):
             "exploration_final_eps": 0.04,
         },
     }  # fmt: skip
-    examples = Examples(
-        start={"state": [0.1, -0.2, 0.05, 0.1]},
-        moving=[0.5, 2.0, 0.1, -3.0],
-        refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
-        ending=([2.39, 2.0, 0.0, 0.0], 1),
-        batch={
-            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
-            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
-        },
-    )
     difficulty = "The pole falls within a second unless it is caught, and there is no push of strength zero."
     note = (
         "The sign of an LQR's control gives the push; this reaches the largest return. So does the beam "
@@ -177,12 +186,8 @@ class CartPoleExact(_OnTrack):
         """Return 1."""
         return 1.0
 
-    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Return whether the cart has left its track, or the pole leans by more than 12 degrees."""
-        return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
 
-
-class CartPoleContinuous(_OnTrack):
+class CartPoleContinuous(_Balance):
     """Balance a pole on a cart with a continuous force, against kicks, near the middle of the track.
 
     ## Description
@@ -276,16 +281,6 @@ class CartPoleContinuous(_OnTrack):
             "policy_kwargs": {"noise_steps": 4, "noise": 0.3},
         },
     }  # fmt: skip
-    examples = Examples(
-        start={"state": [0.1, -0.2, 0.05, 0.1]},
-        moving=[0.5, 2.0, 0.1, -3.0],
-        refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
-        ending=([2.39, 2.0, 0.0, 0.0], 1.0),
-        batch={
-            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
-            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
-        },
-    )
     difficulty = (
         "To move the cart to the middle, it must first be pushed away from it, and each kick hits a pole "
         "that is never stable by itself."
@@ -313,10 +308,6 @@ class CartPoleContinuous(_OnTrack):
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return nothing: outside the limits the formula would fall below 0."""
         return 0.0
-
-    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Return whether the cart has left its track, or the pole leans by more than 12 degrees."""
-        return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Return a change of the pole's rate within ±1 rad/s."""

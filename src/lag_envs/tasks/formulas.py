@@ -10,7 +10,7 @@ import itertools
 import math
 import numbers
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -129,7 +129,7 @@ class TaskFormulas:
     trace = ElementaryTrace
 
     def __init__(self, task: Task, base: type[Task]) -> None:
-        self._task, self._base = task, base
+        self._task, self._base, self._of = task, base, type(task).__name__
         self._chances: dict[float, str] = {}
         scene = task.scene
         self._form = form_of(scene)
@@ -143,7 +143,7 @@ class TaskFormulas:
         self.choices = tuple(len(a.values) for a in self.acting if a.values)
         if self.choices and len(self.choices) != self.actions:
             raise FormulaError(
-                f"{type(task).__name__}.action mixes lists of values with ranges; "
+                f"{self._of}.action mixes lists of values with ranges; "
                 "give every control a list, or every control a range"
             )
         self.clipped = not self.choices
@@ -151,16 +151,13 @@ class TaskFormulas:
         self.largest = float(task.largest_action)
         if not 0.0 < self.largest < math.inf:
             raise FormulaError(
-                f"{type(task).__name__}.largest_action must be above 0 and finite, "
-                f"got {task.largest_action!r}"
+                f"{self._of}.largest_action must be above 0 and finite, got {task.largest_action!r}"
             )
         self.target_boxes = _target_boxes(task)
         self.targets = len(self.target_boxes)
         self.draws = task.draws
         if type(self.draws) is not int or self.draws < 0:
-            raise FormulaError(
-                f"{type(task).__name__}.draws must be a whole number, 0 or more, got {task.draws!r}"
-            )
+            raise FormulaError(f"{self._of}.draws must be a whole number, 0 or more, got {task.draws!r}")
         self.starts = _starts(task)
         self.has_last = type(task).last_reward is not base.last_reward
         known = _checked.setdefault(type(task), {})
@@ -170,7 +167,7 @@ class TaskFormulas:
             names, code = self._recorded()
             if self._recorded()[1] != code:
                 raise FormulaError(
-                    f"{type(task).__name__}: a formula gives another result when it is run again; it may "
+                    f"{self._of}: a formula gives another result when it is run again; it may "
                     "depend on its arguments and on parameters only, not on time or chance"
                 )
             known[key] = names, self._chances
@@ -260,11 +257,14 @@ class TaskFormulas:
         found = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
         rates = {name: found[name] for name in layout.names if name in found}  # in the order of energies
         carried = [e.name for e in layout.state if e.kind == "momentum"]
-        why = carried and (
-            f"the state holds {', '.join(carried)} instead, as velocities jump with "
-            f"{', '.join(str(p.control) for p in layout.at('rate'))}; write the formula with {carried[0]}"
-        )
-        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates, why=why or "")}
+        why = ""
+        if carried:
+            movers = ", ".join(str(p.control) for p in layout.at("rate"))
+            why = (
+                f"the state holds {', '.join(carried)} instead, as velocities jump with {movers}; "
+                f"write the formula with {carried[0]}"
+            )
+        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates, why=why)}
         return State("entry of the state", names, hidden)
 
     def named_targets(self, g: Sequence) -> Values:
@@ -335,16 +335,9 @@ class TaskFormulas:
             return list(given)
         if not isinstance(found, Mapping):
             if len(self.acting) != 1:
-                raise FormulaError(
-                    f"{type(self._task).__name__}.guard must return controls by name, got {found!r:.60}"
-                )
+                raise FormulaError(f"{self._of}.guard must return controls by name, got {found!r:.60}")
             found = {self.acting[0].control: found}
-        for name in found:
-            if name not in wanted:
-                raise FormulaError(
-                    f"{type(self._task).__name__}.guard: there is no control {name!r}, "
-                    f"only {', '.join(wanted)}"
-                )
+        self._check_names("guard", "control {!r}", found, wanted)
         return list((wanted | dict(found)).values())
 
     def outcome(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
@@ -375,15 +368,11 @@ class TaskFormulas:
         added = self._call("kick", k, self.named_state(z), drawn, self._known(xp, z))
         if not isinstance(added, Mapping):
             self._refuse("kick", added, "changes of the state's entries by name")
+        self._check_names("kick", "entry {!r} of the state", added, self.state)
         after = dict(zip(self.state, z, strict=False))
         for name, value in added.items():
             if isinstance(value, Values):
                 self._refuse("kick", value, "numbers")
-            if name not in after:
-                raise FormulaError(
-                    f"{type(self._task).__name__}.kick: there is no entry {name!r} of the state, "
-                    f"only {', '.join(self.state)}"
-                )
             after[name] = after[name] + value
         angle = None if self._form is None else self._form.angle
         if angle is None or self.state[angle] not in added:
@@ -395,10 +384,7 @@ class TaskFormulas:
         """Return the observation."""
         found = self._call("observe", k, self.named_state(y), self.named_targets(g), self._known(xp, y))
         if not isinstance(found, Mapping) or not found:
-            raise FormulaError(
-                f"{type(self._task).__name__}.observe must return numbers by name, in order, "
-                f"got {found!r:.60}"
-            )
+            raise FormulaError(f"{self._of}.observe must return numbers by name, in order, got {found!r:.60}")
         return [_counted(value) for value in found.values()]
 
     def _recorded(self) -> tuple[tuple[str, ...], str]:
@@ -435,7 +421,7 @@ class TaskFormulas:
         for name, entries in (("guard", self._controls), ("observe", names)):
             for entry, value in zip(entries, found[name], strict=True):
                 if isinstance(value, numbers.Real):  # the same in every step
-                    _numbers_of(f"{type(self._task).__name__}.{name}[{entry!r}]", [value])
+                    _numbers_of(f"{self._of}.{name}[{entry!r}]", [value])
         code = trace.operations([ended, *itertools.chain(*found.values())])
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
 
@@ -444,7 +430,15 @@ class TaskFormulas:
         got = kinds.get(type(found)) or f"{found!r:.60}"
         if isinstance(found, Values):
             wanted += "; take an entry by its name, as in control.NAME or after.NAME"
-        raise FormulaError(f"{type(self._task).__name__}.{name} returns {got}; it must return {wanted}")
+        raise FormulaError(f"{self._of}.{name} returns {got}; it must return {wanted}")
+
+    def _check_names(self, formula: str, what: str, given: Iterable[str], known: Iterable[str]) -> None:
+        """Raise a FormulaError if a formula's result has a name that is not known; `what` is its format."""
+        for name in given:
+            if name not in known:
+                raise FormulaError(
+                    f"{self._of}.{formula}: there is no {what.format(name)}, only {', '.join(known)}"
+                )
 
     def sample_start(self, draws: Sequence, k: Any) -> list:
         """Return the entries of a state and the targets at an episode's start, from draws in [0, 1)."""
@@ -487,18 +481,13 @@ class TaskFormulas:
         given = self._task.bounds()
         if not isinstance(given, Mapping):
             self._refuse("bounds", given, "bounds by name, or {} if none is known")
-        for name in given:
-            if name not in self.observation:
-                raise FormulaError(
-                    f"{type(self._task).__name__}.bounds: there is no observation {name!r}, "
-                    f"only {', '.join(self.observation)}"
-                )
+        self._check_names("bounds", "observation {!r}", given, self.observation)
         low, high, unbounded = [], [], self._task.unbounded
         # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
         endless = math.isinf(self._task.duration)
         for name in self.observation:
             bound = given.get(name, unbounded)
-            where = f"{type(self._task).__name__}.bounds[{name!r}]"
+            where = f"{self._of}.bounds[{name!r}]"
             try:
                 bottom, top = map(float, bound if isinstance(bound, tuple | list) else (-bound, bound))
                 wrong = bottom > top if endless else not bottom <= top

@@ -24,18 +24,6 @@ from lag_envs.tasks.formulas import UNBOUNDED
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
 
-#: The keywords.
-KEYWORDS = (
-    "randomize",
-    "observation_noise",
-    "observation_delay",
-    "observation_every",
-    "action_noise",
-    "action_delay",
-    "slew",
-    "lag",
-    "push",
-)
 #: No normal draw is larger: √(2 · 53 log 2), since the uniform number behind it is at least 2^-53.
 LARGEST_NORMAL = math.sqrt(106.0 * math.log(2.0)) * (1.0 + 1e-9)
 #: Control steps by which actions and observations may be late.
@@ -182,7 +170,8 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
             if name in given:
                 raise
             raise ValueError(f"{type(task).__name__}.imperfections: {error}") from error
-    return Imperfections(**found) if Imperfections(**found) != Imperfections() else None
+    made = Imperfections(**found)
+    return None if made == Imperfections() else made
 
 
 # --- one keyword each ---------------------------------------------------------------------------------------
@@ -375,6 +364,7 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
     return Draw(name, base, low, high, log)
 
 
+#: What reads each keyword.
 _READERS: dict[str, Callable[[Task, Any], dict[str, Any]]] = {
     "randomize": _randomize,
     "observation_noise": _observation_noise,
@@ -386,7 +376,8 @@ _READERS: dict[str, Callable[[Task, Any], dict[str, Any]]] = {
     "lag": _lag,
     "push": _push,
 }
-assert tuple(_READERS) == KEYWORDS
+#: The keywords.
+KEYWORDS = tuple(_READERS)
 
 
 # --- drawn parameters ---------------------------------------------------------------------------------------

@@ -146,8 +146,8 @@ def render(
     """Return the pages, the overview last, and the files they refer to: content by path.
 
     If the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
-    `source` is the address of the project's files, to which submissions are linked, `documentation` that of the
-    environments' pages, ID.html; both end with a slash.
+    `source` is the address of the project's files, to which submissions are linked, `documentation` that of
+    the environments' pages, ID.html; both end with a slash.
     """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
@@ -202,7 +202,8 @@ def render(
         "made": data["made"], "style": style,
         "script": script, "drive": drive, "protocol": data["protocol"],
         "embed": lambda value: Markup(page_json(value)), "url": url and url.rstrip("/") + "/",
-        "site": site, "source": source, "documentation": documentation, "preview": next((b["preview"] for b in boards), None),
+        "site": site, "source": source, "documentation": documentation,
+        "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
