@@ -4,6 +4,7 @@ import copy
 import inspect
 import math
 import pickle
+import re
 from fractions import Fraction
 
 import cloudpickle
@@ -500,6 +501,33 @@ def test_scene_of_sympys_expressions_has_all_functions():
     for x in (-0.3, 0.2, 1.0):
         expected = -float(potential.diff(q).subs(q, x)) / (4 / 3)
         assert scene.acceleration([x, 0.0])["q"] == pytest.approx(expected, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("lambda", "a keyword of Python"),
+        ("class", "a keyword of Python"),
+        (r"\theta", "no name; use letters, digits"),
+        ("theta ", "no name"),
+        ("1a", "no name"),
+        ("a'", "no name"),
+        ("mu_{k}", "no name"),
+    ],
+)
+def test_parameters_of_sympys_expressions_that_are_no_names(name, why):
+    q, q_dot, bad = *sympy.symbols("q q_dot"), sympy.Symbol(name)
+    with pytest.raises(FormulaError, match=re.escape(f"Odd: {name!r} is {why}")):
+        Scene.from_sympy("Odd", bad * q_dot**2, sympy.cos(q), coordinates={q: "rad"}, parameters={bad: 2.0})
+
+
+def test_names_of_sympys_expressions_are_those_that_python_reads():
+    micro, rate, sign = sympy.symbols("\u00b5 \u00b5_dot \u03d1")
+    scene = Scene.from_sympy(
+        "Mu", rate**2 / 2, sign * micro**2 / 2, coordinates={micro: "m"}, parameters={sign: 2.0}
+    )
+    assert scene.state_names == ("\u03bc", "\u03bc_dot") and scene() == scene(θ=2.0)
+    assert scene.acceleration([1.5, 0.0]) == {"\u03bc": -3.0}
 
 
 @pytest.mark.parametrize(

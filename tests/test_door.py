@@ -303,6 +303,10 @@ DECLARED = {
     "coordinates without units": ({"coordinates": ("x", "y")}, 'coordinates; {"x": "m"}'),
     "unit that is no text": ({"coordinates": {"x": "m", "y": 1.0}}, "coordinates; unit of 'y'"),
     "keyword": ({"coordinates": {"x": "m", "lambda": "m"}}, "coordinates; 'lambda'; keyword"),
+    "name that Python reads as another": (
+        {"coordinates": {"x": "m", "\u00b5": "m"}},
+        "coordinates; Python reads '\u00b5' in a formula as '\u03bc', '\\u03bc'; write it so",
+    ),
     "name with a blank": ({"coordinates": {"x": "m", "x 1": "m"}}, "coordinates; 'x 1'"),
     "name with an underscore first": ({"coordinates": {"x": "m", "_x": "m"}}, "coordinates; '_x'"),
     "coordinate beside its rate": (
@@ -521,7 +525,7 @@ def scene_of_version_0_1():
     return Bad
 
 
-@mistake("hashable")
+@mistake("unhashable type: 'list'", "structural fields must be hashable: give a tuple")
 def structural_field_that_is_a_list():
     class Bad(Good):
         lengths: tuple = ()

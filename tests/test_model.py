@@ -12,8 +12,8 @@ from rollouts import actions, make
 
 from lag_envs.controllers.mpc import MPC
 from lag_envs.envs.model import Model
-from lag_envs.scenes import StepRefused
-from lag_envs.tasks import TASKS, incline, pivoted_bar
+from lag_envs.scenes import Scene, StepRefused
+from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
 
 
 @pytest.mark.parametrize("env_id", covering(PERFECT, engine))
@@ -45,6 +45,49 @@ def test_far_from_ordinary_steps_are_taken_too():
     ends, _, _ = Model(task)([[0.3, 90.0]], [0.5])
     exact = task.scene.simulate([0.3, 90.0], [2.5], 0.02)[1]
     np.testing.assert_allclose(ends[0], exact, rtol=1e-14)
+
+
+def test_a_refusal_names_the_applied_control():
+    """Not the action, which is clipped, scaled and guarded."""
+
+    class Uphill(Scene):
+        coordinates = {"x": "m"}
+        controls = {"f": "N"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return xp.sqrt(q.x)
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.f}
+
+    class Climb(Task):
+        scene = Uphill
+        action = {"f": (0.0, 50.0)}
+
+        def guard(self, wanted, before, dt, xp):
+            return {"f": wanted.f - xp.sqrt(3.0 - before.x)}
+
+        def observe(self, after, target, xp):
+            return {"x": after.x}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return after.x
+
+    model = Model(Climb())
+    for action, control in ((0.5, 35.5), (7.0, 48.0)):
+        with pytest.raises(StepRefused, match=rf"the step of row 1 .* with f={control:g} and dt=0.02 s"):
+            model([[1.0, 0.0], [-1.0, 0.0]], [0.0, action])
+    states, message = (
+        [[1.0, 0.0], [4.0, 0.0]],
+        "the step of row 1 .* with f=nan .* if the task has a guard, look",
+    )
+    with pytest.raises(StepRefused, match=message):
+        model(states, [0.0, 0.0])
+    with pytest.raises(StepRefused, match=message):
+        model.vjp(states, [0.0, 0.0], by_states=1.0, ends=states)
 
 
 def test_bad_input_is_named():

@@ -234,6 +234,23 @@ def test_refusal_where_a_formula_has_no_value(place):
         Uphill().simulate([place, 0.0], 1, 0.02)
 
 
+def test_the_motion_of_a_logarithm_is_that_of_the_size():
+    """As docs/tutorial.md says: the equation of motion has its derivative only."""
+
+    class Charge(Scene):
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return -xp.log(q.x)
+
+    scene = Charge()
+    np.testing.assert_array_equal(scene.simulate([-1.0, 0.1], 5, 0.1), -scene.simulate([1.0, -0.1], 5, 0.1))
+    assert np.isnan(scene.energy([-1.0, 0.1])["total"])
+
+
 @pytest.mark.parametrize("kind", [own_tasks.Deliver, pivoted_bar.SwingUp])
 def test_refusal_after_a_kick_that_is_no_number(kind):
     def kick(self, after, draws, xp):
@@ -245,6 +262,25 @@ def test_refusal_after_a_kick_that_is_no_number(kind):
     env.step(env.action_space.sample())
     with pytest.raises(StepRefused, match="the state is not finite; reset the episode"):
         env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize("kind", [own_tasks.Deliver, pivoted_bar.SwingUp])
+@pytest.mark.parametrize("imperfections", [{}, {"lag": 0.05}])
+def test_refusal_after_a_guard_that_is_no_number(kind, imperfections):
+    def guard(self, wanted, before, dt, xp):
+        name = self.scene.control_names[-1]
+        return {name: wanted[name] + xp.log(before[0])}
+
+    torn = {"id": "OwnTornGuard-v0", "guard": guard, "terminated": Task.terminated}
+    vec = gym.make_vec(lag_envs.register(type("Torn", (kind,), torn)), num_envs=3, **imperfections)
+    vec.reset(seed=0)
+    state = vec.unwrapped.state
+    state[:, 0] = 0.1, -0.1, 0.2
+    vec.reset(options={"state": state})
+    message = "the step of environment 1 .*=nan .* the control is not finite; if the task has a guard"
+    with pytest.raises(StepRefused, match=message) as refusal:
+        vec.step(np.zeros(vec.action_space.shape, np.float32))
+    assert np.isfinite(refusal.value.results[1][[0, 2]]).all()
 
 
 @pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
@@ -401,11 +437,92 @@ def _mistaken(**changes):
         ({"terminated": lambda self, after, target, xp: after.x & (after.x > 0)}, "take comparisons"),
         ({"reward": lambda self, b, after, *a: a[-1].where(after.x, 1.0, 0.0)}, "take comparisons"),
         ({"reward": lambda self, b, after, *_: (after.x > 0) + (b.x > 0)}, "applied to comparisons alone"),
+        (
+            {"reward": lambda self, b, after, *_: self.scene.energy([*after])["total"]},
+            "reward: a formula calls something derived .* self.scene.kinetic and self.scene.potential",
+        ),
+        ({"imperfections": {"lag": -1.0}}, "^Mistaken.imperfections: lag must be 0 or at least .* got -1 s"),
+        (
+            {"target": {}, "observe": lambda self, after, target, xp: {"x": target.x_goal}},
+            "no target 'x_goal', nor any other",
+        ),
     ],
 )
 def test_mistakes_in_a_task(changes, message):
     with pytest.raises((FormulaError, ValueError), match=message):
         _mistaken(**changes)().formulas.box()
+
+
+class Pushed(Scene):
+    """A bead on a rail that is pushed at a given rate: its state holds w."""
+
+    coordinates = {"x": "m"}
+    prescribed = {"s": "m"}
+    controls = {"s_dot": "m/s"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.x + v.s) ** 2
+
+    def potential(self, q, xp):
+        return 0.0
+
+
+class Hidden(Scene):
+    """A scene whose coordinate has the name of the velocities."""
+
+    coordinates = {"v": "m"}
+    controls = {"f": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.v**2
+
+    def potential(self, q, xp):
+        return 0.0
+
+    def applied(self, q, v, u, xp):
+        return {"v": u.f}
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        (
+            Pushed,
+            "Energetic.reward: there is no velocity of a coordinate 'x', nor any other; the state holds w "
+            "instead, as velocities jump with s_dot; write the formula with w",
+        ),
+        (Hidden, "Energetic.reward: after.v is the place of the coordinate 'v', which hides the velocities"),
+    ],
+)
+def test_velocities_that_a_task_cannot_have(scene, message):
+    class Energetic(Task):
+        action = {next(iter(scene.controls)): 1.0}
+
+        def observe(self, after, target, xp):
+            return {"first": after[0]}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return self.scene.kinetic(after, after.v, xp)
+
+    Energetic.scene = scene
+    with pytest.raises(FormulaError, match=message):
+        Energetic()
+
+
+def test_a_state_is_not_taken_for_velocities():
+    def energy(self, before, after, control, target, dt, xp):
+        return self.scene.kinetic(after, after, xp)
+
+    def loss(self, before, after, control, target, dt, xp):
+        return self.scene.dissipation(before, v=before, u=control, xp=xp)
+
+    def force(self, before, after, control, target, dt, xp):
+        return self.scene.applied(before, before, control, xp)["x"]
+
+    for name, reward in (("kinetic", energy), ("dissipation", loss), ("applied", force)):
+        message = rf"Mistaken.reward: self.scene.{name} is given the state .*; give after.v or before.v"
+        with pytest.raises(FormulaError, match=message):
+            _mistaken(reward=reward)()
 
 
 def test_velocities_of_a_task_are_in_the_order_of_energies():

@@ -134,9 +134,19 @@ class Model:
         ends, rewards, ended = np.empty_like(states), np.empty(n), np.empty(n, np.bool_)
         refused = self._step(states, actions, targets, self._numbers, ends, rewards, ended)
         if refused:
-            state, action = states[refused - 1], actions[refused - 1]
-            raise self.task.formulas.refusal(state, action, self.task.dt, f"the step of row {refused - 1}")
+            i = refused - 1
+            held = self._control(states[i], actions[i], targets[i])
+            raise self.task.formulas.refusal(states[i], held, self.task.dt, f"the step of row {i}")
         return ends, rewards, ended
+
+    @np.errstate(all="ignore")
+    def _control(self, state: Array, action: Array, target: Array) -> list[float]:
+        """Return the controls that one action applies in a state."""
+        formulas = self.task.formulas
+        if formulas.clipped:
+            action = np.clip(action, -formulas.largest, formulas.largest)
+        y = lifted(form_of(self.task.scene), state, np)
+        return [float(u) for u in formulas.control(np, [*action], y, [*target], self._constants)]
 
     def _checked(
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None

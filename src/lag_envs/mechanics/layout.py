@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import keyword
+import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -97,6 +98,8 @@ def check_name(where: str, name: Any) -> str:
     ):
         why = "a keyword of Python" if isinstance(name, str) and keyword.iskeyword(name) else "no name"
         raise FormulaError(f"{where}: {name!r} is {why}; use letters, digits and _ as in q.theta_1")
+    if name != (read := unicodedata.normalize("NFKC", name)):  # many look alike: µ and μ, ϑ and θ
+        raise FormulaError(f"{where}: Python reads {name!r} in a formula as {read!r}, {read!a}; write it so")
     return name
 
 

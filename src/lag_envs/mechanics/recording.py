@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import inspect
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from lag_envs.errors import hint
@@ -45,9 +45,11 @@ def control(name: str) -> Atom:
 class Values:
     """Numbers by name, by index and in order: ``q.theta``, ``q[0]``, ``x, theta = q``."""
 
-    __slots__ = ("_hidden", "_items", "_what")
+    __slots__ = ("_hidden", "_items", "_what", "_why")
 
-    def __init__(self, what: str, items: Mapping[str, Any], hidden: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, what: str, items: Mapping[str, Any], hidden: Mapping[str, Any] | None = None, why: str = ""
+    ) -> None:
         """Hold numbers.
 
         Parameters
@@ -58,10 +60,13 @@ class Values:
             The numbers, in order.
         hidden : mapping, optional
             Further numbers, accessible by name only.
+        why : str, optional
+            Why a number may be missing, for error messages.
         """
         object.__setattr__(self, "_what", what)
         object.__setattr__(self, "_items", dict(items))
         object.__setattr__(self, "_hidden", dict(hidden or {}))
+        object.__setattr__(self, "_why", f"; {why}" if why else "")
 
     def __getattr__(self, name: str) -> Any:
         for found in (self._items, self._hidden):
@@ -69,9 +74,7 @@ class Values:
                 return found[name]
         if name.startswith("__"):
             raise AttributeError(name)
-        raise FormulaError(
-            f"there is no {self._what} {name!r}, only {', '.join(self._items) or 'none at all'}"
-        )
+        raise FormulaError(f"there is no {self._what} {name!r}, {_others(self._items)}{self._why}")
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, str):
@@ -82,6 +85,7 @@ class Values:
         except IndexError:
             raise FormulaError(
                 f"there is no {self._what} number {index}, only {len(values)} of them, counted from 0"
+                f"{self._why}"
             ) from None
 
     def __iter__(self) -> Iterator[Any]:
@@ -101,6 +105,11 @@ class Values:
 
     def __repr__(self) -> str:
         return f"<{self._what}s {', '.join(self._items)}>"
+
+
+def _others(names: Collection[str]) -> str:
+    """Return what there is besides a name that is missing."""
+    return f"only {', '.join(names)}" if names else "nor any other"
 
 
 def parameter_names(scene: Any) -> tuple[str, ...]:
@@ -304,7 +313,7 @@ def _by_name(values: Any, names: Sequence[str], what: str) -> dict[str, Expr]:
         )
     for name in values:
         if name not in names:
-            raise FormulaError(f"there is no {what} {name!r}, only {', '.join(names) or 'none at all'}")
+            raise FormulaError(f"there is no {what} {name!r}, {_others(names)}")
     return {name: single_expression(values[name], f"for {name!r} it ") for name in names if name in values}
 
 

@@ -219,7 +219,8 @@ class Scene(metaclass=SceneType):
         """The derived equations, as expressions."""
         if TWIN in vars(self):
             raise FormulaError(
-                "a formula calls something derived from it; it may use only parameters and other formulas"
+                "a formula calls something derived from it; it may use only parameters and other formulas: "
+                "in a task, self.scene.kinetic and self.scene.potential for the energy"
             )
         found = vars(self).get("_cached_mechanics")
         if found is None:
@@ -252,9 +253,10 @@ class Scene(metaclass=SceneType):
 
     def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[MotionPoint, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
+        mechanics = self.mechanics
         states, controls, shape = check_both(self, state, control)
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
-        return MotionPoint(self.mechanics, self._symbols(), y, u, Numeric), shape
+        return MotionPoint(mechanics, self._symbols(), y, u, Numeric), shape
 
     def _symbols(self) -> dict[Atom, Any]:
         """Return the parameters' values by symbol."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.mechanics.layout import units
+from lag_envs.mechanics.layout import check_name, units
 
 #: Class attributes that are mappings, and those that are names in order.
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
@@ -52,6 +52,9 @@ def complete(cls: type) -> None:
             "Scene is the base of scenes; derive a class with coordinates, kinetic and potential"
         )
     if "__dataclass_fields__" not in vars(cls):
+        for name in own_annotations(cls):  # a class that is made by code may have names of any kind
+            if not name.startswith("_"):
+                check_name(cls.__name__, name)
         # For annotations that are texts, a dataclass looks into the class's module. A class that was sent to
         # another process by value may have none there.
         absent = cls.__module__ not in sys.modules

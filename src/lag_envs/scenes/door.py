@@ -62,7 +62,9 @@ def admit(scene: Any, base: type) -> None:
         key = structure_of(scene)
         known = _admitted.setdefault(type(scene), {}).get(key)
     except TypeError as error:
-        raise FormulaError(f"{type(scene).__name__}: {error}; structural fields must be hashable") from error
+        raise FormulaError(
+            f"{type(scene).__name__}: {error}; structural fields must be hashable: give a tuple"
+        ) from error
     if known is not None and is_own(type(scene)):
         vars(scene)["_cached_layout"], vars(scene)["_cached_mechanics"] = known
     elif known is None:

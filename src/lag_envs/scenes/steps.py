@@ -249,7 +249,7 @@ def _check_refused(
         row, held = i if rows is None else rows[i], controls[i][None] if scene.control_names else 1
         try:
             scene.simulate(states[i], held, dt)
-        except StepRefused:
+        except (StepRefused, ValueError):  # the latter for a control that is not finite, from a guard
             raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {row}") from None
         raise StepRefused(
             f"the step of row {row} can be taken, but its derivatives cannot be found: they need more than "
@@ -333,6 +333,8 @@ def refusal(
     remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
     if not np.isfinite(state).all():
         why, remedy = "the state is not finite", "reset the episode; if the task has a kick, look there"
+    elif not np.isfinite(values).all():
+        why, remedy = "the control is not finite", "if the task has a guard, look there"
     elif form_of(scene) is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
         remedy = "take a smaller dt or milder parameters"

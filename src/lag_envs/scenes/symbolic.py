@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
+import unicodedata
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from functools import lru_cache
@@ -181,7 +182,7 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
         if isinstance(symbol, AppliedUndef):
             places[sympy.Derivative(symbol, *symbol.args)] = ("v", _name(symbol))
         else:
-            places[sympy.Symbol(f"{_name(symbol)}_dot", **symbol._assumptions_orig)] = ("v", _name(symbol))
+            places[sympy.Symbol(f"{symbol.name}_dot", **symbol._assumptions_orig)] = ("v", _name(symbol))
     places |= {symbol: ("u", _name(symbol)) for symbol in given["controls"]}
     places |= {symbol: ("self", _name(symbol)) for symbol in given["parameters"]}
 
@@ -231,12 +232,13 @@ def _remake(base: type[Scene], name: str, items: tuple, formulas: tuple, fields:
 
 
 def _name(symbol: Any) -> str:
-    if isinstance(symbol, str):
-        return symbol
+    """Return a symbol's name as Python would read it."""
     if isinstance(symbol, AppliedUndef):
-        return symbol.func.__name__
+        symbol = symbol.func.__name__
     if isinstance(symbol, sympy.Symbol):
-        return symbol.name
+        symbol = symbol.name
+    if isinstance(symbol, str):
+        return unicodedata.normalize("NFKC", symbol)
     raise FormulaError(f"{symbol!r} is neither a SymPy symbol nor a function of time; it cannot be a name")
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.mechanics.recording import Values, formula, parameter_names, twin
+from lag_envs.mechanics.recording import ARGUMENTS, Values, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of
 from lag_envs.scenes.door import is_own
@@ -66,6 +66,12 @@ class RecordedStep(NamedTuple):
     k: Any
     form: NormalForm | None
     chance: Callable[[float], Any]
+
+
+class State(Values):
+    """The entries of a state by name, which are no velocities."""
+
+    __slots__ = ()
 
 
 class Lifted:
@@ -230,6 +236,8 @@ class TaskFormulas:
             vars(task).pop(name, None)
         names = parameter_names(self._task.scene)
         task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
+        for name in ("kinetic", "dissipation", "applied"):
+            vars(task.scene)[name] = _taking_velocities(task.scene, name)
         task.dt = k.dt
         task._recording = RecordedStep(
             k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
@@ -242,14 +250,22 @@ class TaskFormulas:
             return xp
         return Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
 
-    def named_state(self, y: Sequence) -> Values:
+    def named_state(self, y: Sequence) -> State:
         """Return the entries of a state by name, and the velocities by coordinate."""
         layout = layout_of(self._task.scene)
         names = dict(zip(self.state, y, strict=False))
         found = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
         rates = {name: found[name] for name in layout.names if name in found}  # in the order of energies
-        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates)}
-        return Values("entry of the state", names, hidden)
+        carried = [e.name for e in layout.state if e.kind == "momentum"]
+        why = ""
+        if carried:
+            movers = ", ".join(str(p.control) for p in layout.at("rate"))
+            why = (
+                f"the state holds {', '.join(carried)} instead, as velocities jump with {movers}; "
+                f"write the formula with {carried[0]}"
+            )
+        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates, why=why)}
+        return State("entry of the state", names, hidden)
 
     def named_targets(self, g: Sequence) -> Values:
         """Return the targets by name."""
@@ -265,6 +281,11 @@ class TaskFormulas:
             try:
                 result = getattr(task, name)(*arguments)
             except AttributeError as error:
+                names = layout_of(self._task.scene).names
+                if isinstance(error.obj, TracedNumber) and "v" in self.state and error.name in names:
+                    raise FormulaError(
+                        "after.v is the place of the coordinate 'v', which hides the velocities; rename it"
+                    ) from error
                 if not isinstance(error.obj, ElementaryTrace):
                     raise
                 raise FormulaError(
@@ -477,6 +498,23 @@ class TaskFormulas:
             low.append(bottom if bottom > -UNBOUNDED else -unbounded)
             high.append(top if top < UNBOUNDED else unbounded)
         return low, high
+
+
+def _taking_velocities(scene: Any, name: str) -> Callable:
+    """Return a formula of the scene that refuses a state in place of velocities.
+
+    Places have the names of velocities, and would be taken for them.
+    """
+    method, position = getattr(scene, name), ARGUMENTS[name].index("v")
+
+    def checked(*given: Any, **named: Any) -> Any:
+        if isinstance(given[position] if len(given) > position else named.get("v"), State):
+            raise FormulaError(
+                f"self.scene.{name} is given the state in place of the velocities; give after.v or before.v"
+            )
+        return method(*given, **named)
+
+    return checked
 
 
 def _counted(value: Any) -> Any:

@@ -164,7 +164,12 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
     asked = {name: value for name, value in (dict(own) | dict(given)).items() if value is not None}
     found: dict[str, Any] = {}
     for name, value in asked.items():
-        found |= _READERS[name](task, value)
+        try:
+            found |= _READERS[name](task, value)
+        except ValueError as error:
+            if name in given:
+                raise
+            raise ValueError(f"{type(task).__name__}.imperfections: {error}") from error
     made = Imperfections(**found)
     return None if made == Imperfections() else made
 
