@@ -281,6 +281,52 @@ def test_powers_about_a_far_place_keep_their_digits():
     np.testing.assert_allclose(after, near.simulate(here, 1, 0.02)[1], rtol=1e-12)
 
 
+class Wells(Scene):
+    """A slider in wells about a far place, and another one on a hardening spring between them."""
+
+    products: bool = True
+    where: float = parameter(100.0, "m")
+    depth: float = parameter(1.5, "J", above=0.0)
+    coordinates = {"x": "m", "y": "m"}
+    controls = {"force": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2 + 0.5 * v.y**2
+
+    def potential(self, q, xp):
+        d, e, k = q.x - self.where, q.y - q.x, self.depth
+        if self.products:
+            wells = k * (d - 2) * (d - 1) * (d - 0.5) * (d + 0.5) * (d + 1) * (d + 2)
+            return wells + e * e / 2 + e * e * e * e / 4
+        return k * (d**6 - 5.25 * d**4 + 5.25 * d**2 - 1) + e**2 / 2 + e**4 / 4
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.force}
+
+
+@pytest.mark.parametrize("products", [True, False])
+@pytest.mark.parametrize("where", [100.0, -300.3])
+def test_wells_about_a_far_place_take_few_substeps(where, products):
+    """Multiplied out, the wells at 100 m had errors of 5e-7 m/s after 415 substeps."""
+    scene, control = Wells(where=where, products=products), [0.1]
+    for d, e in ((0.75, 0.4), (-1.9, -1.1), (1.3, 0.2)):
+        state = np.array([where + d, 0.3, where + d + e, -0.5])
+        exact = np.array([float(x) for x in oracle_of(scene).flow(state, control, 0.02)])
+        error = np.abs(scene.simulate(state, [control], 0.02)[-1] - exact)
+        assert (error <= 1e-15 * np.maximum(1.0, np.abs(state))).all()
+        assert scene.step_bound(state, control, 0.02).substeps <= 3
+
+
+def test_product_of_a_sum_has_the_record_of_its_power():
+    class Spring(Wells):
+        def potential(self, q, xp):
+            d = q.y - q.x
+            return self.depth * d * d * d * d if self.products else self.depth * d**4
+
+    assert Spring().mechanics.key == Spring(products=False).mechanics.key
+    assert code_of(Spring(), 0.02) is code_of(Spring(products=False), 0.02)
+
+
 def test_what_rests_leaves_no_code():
     for scene in (PivotedBar(), *(Incline(control=mode) for mode in Incline.modes), CylinderInCylinder()):
         for name in ("rise", "lift", "slip", "gap"):

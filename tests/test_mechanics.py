@@ -1,5 +1,6 @@
 """The algebra of recorded formulas against numbers in 30 digits, and operations that a record leaves out."""
 
+import math
 import pickle
 import random
 from collections import Counter
@@ -116,6 +117,48 @@ def test_products_of_long_sums_are_kept():
     assert agree(value, sum(a**n for n in range(70)) * sum(b**n for n in range(70)))
     (slope,) = evaluate([derivative(product, PLACES[0])], values(), mpmath)
     assert agree(slope, sum(n * a ** (n - 1) for n in range(1, 70)) * sum(b**n for n in range(70)))
+
+
+C, K = (Expr.of(Atom("parameter", name)) for name in "ck")
+
+
+def test_products_of_a_sum_are_its_powers():
+    d = X - C
+    assert (d * d * d * d).same(d**4) and (d * d**2 * d).same(d**4)
+    assert (0.5 * K * d * d * d * d).same(0.5 * K * d**4)
+    assert (d * -d * (2 * d)).same(-2 * d**3)
+    assert (X * d * (X * d) * d).same(X**2 * d**3)
+    assert (d**3 / d).same(d**2) and (d / d).same(Expr.of(1)) and (2 * d / d**2).same(2 / d)
+    fast = Expr.of(Atom("velocity", "a")) - Expr.of(Atom("velocity", "b"))
+    assert (fast * fast**3).same(fast**4)
+
+
+def test_products_of_moving_sums_stay_factors():
+    def factors(x, y, c):
+        d = x - c
+        return [d - 2, 3 * d + 1, d * d - 0.25, y - x, x * y - c * y, 1 + x / (1 + d * d)]
+
+    product = math.prod(factors(X, Y, C))
+    assert len(product.terms) == 1
+    for seed in range(5):
+        shuffled = random.Random(seed).sample(factors(X, Y, C), 6)
+        assert math.prod(shuffled).same(product)
+        assert (math.prod(shuffled[:3]) * math.prod(shuffled[3:])).same(product)
+    x, y, c = map(mpmath.mpf, ("1024.7", "1023.1", "1024.4"))
+    known = dict(zip([*PLACES[:2], *C.atoms()], map(float, (x, y, c)), strict=True))
+    x, y, c = map(mpmath.mpf, known.values())
+    slope = mpmath.diff(lambda x: math.prod(factors(x, y, c)), x)
+    found = evaluate([product, derivative(product, PLACES[0])], known, math)
+    assert found == pytest.approx([math.prod(factors(x, y, c)), slope], rel=1e-12)
+    there = math.prod(factors(Expr.of(1024.5), Y, C))
+    assert substitute(product, {PLACES[0]: Expr.of(1024.5)}).same(there)
+
+
+def test_sums_that_may_meet_others_are_multiplied_out():
+    d, c, v = X - C, function_of("cos", X), Expr.of(Atom("velocity", "a"))
+    for a, b in ((1 + c, 2 + c), (1 + v, 2 + v), (1 + v, d), (1 + c, d), (1 + K, d), (1 + K, 2 + K)):
+        assert len((a * b).terms) > 2 and (a * b).same(b * a)
+    assert apply_identities((1 + c) * (1 - c) - 1).same(-c * c)
 
 
 # --- records ------------------------------------------------------------------------------------------------

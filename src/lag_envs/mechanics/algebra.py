@@ -3,10 +3,10 @@
 Energies are run once on `Expr` objects. An `Expr` is kept expanded, as a map from monomials to rational
 coefficients, so that equal terms are merged and terms that cancel leave nothing behind: deriving an equation
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
-an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers of sums
-that change with the motion are not expanded, except squares whose terms may combine with others. Besides the
-rules of sums and products there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that
-agree in everything else (`apply_identities`).
+an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers and
+products of sums that change with the motion are not expanded, except squares and products whose terms may
+combine with others. Besides the rules of sums and products there are two more: √x² = x, and cos² + sin² = 1,
+which is applied to terms that agree in everything else (`apply_identities`).
 
 Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
 same bits in every process.
@@ -84,6 +84,10 @@ def _exact(value: Any) -> int | Fraction:
     if isinstance(value, int | Fraction):
         return value
     return int(number) if number.is_integer() else Fraction(number)
+
+
+def _simplest(number: Fraction) -> int | Fraction:
+    return int(number) if number.denominator == 1 else number
 
 
 class Expr:
@@ -185,7 +189,7 @@ class Expr:
 
     def __mul__(self, other: Any) -> Expr:
         second = Expr.of(other)
-        kept = self._kept(2) if self.same(second) else None
+        kept = self._kept(2) if self.same(second) else _kept_product(self, second)
         return _expanded(self, second) if kept is None else kept
 
     __rmul__ = __mul__
@@ -233,14 +237,19 @@ class Expr:
         """
         if exponent < 2 or len(self.terms) < 2:
             return None
-        first, *others = (dict(monomial) for monomial in self.terms)
-        shared = {a: min([n, *(o.get(a, 0) for o in others)]) for a, n in first.items()}
-        shared = {a: n for a, n in shared.items() if n > 0}
-        rest = self * Expr({tuple((a, -n) for a, n in shared.items()): 1}) if shared else self
+        shared, rest = self._divided()
         if not rest._stays(exponent):
             return None
         power = Expr({((Atom("function", "sum", rest), exponent),): 1})
-        return power * Expr({tuple((a, n * exponent) for a, n in shared.items()): 1})
+        return power * Expr({tuple((a, n * exponent) for a, n in shared): 1})
+
+    def _divided(self) -> tuple[Monomial, Expr]:
+        """Return a factor that all terms share, and the sum without it."""
+        first, *others = (dict(monomial) for monomial in self.terms)
+        shared = {a: min([n, *(o.get(a, 0) for o in others)]) for a, n in first.items()}
+        shared = {a: n for a, n in shared.items() if n > 0}
+        rest = _expanded(self, Expr({tuple((a, -n) for a, n in shared.items()): 1})) if shared else self
+        return tuple(shared.items()), rest
 
     def _stays(self, exponent: int) -> bool:
         """Return whether this power of the sum is not expanded.
@@ -257,15 +266,24 @@ class Expr:
             a.function in meets or s.kind == "velocity" for a in moving for s in Expr.of(a).symbols()
         )
 
+    def _is_factor(self) -> bool:
+        """Return whether the sum stays apart in a product with another such sum."""
+        return self._stays(2) and any(s.kind == "place" for s in self.symbols())
+
+    def _ratio(self, other: Expr) -> int | Fraction | None:
+        """Return the number that gives this when `other` is multiplied by it, or None if there is none."""
+        if self.terms.keys() != other.terms.keys():
+            return None
+        ratios = {Fraction(c) / other.terms[monomial] for monomial, c in self.terms.items()}
+        return _simplest(ratios.pop()) if len(ratios) == 1 else None
+
     def reciprocal(self) -> Expr:
         """Return one over the expression."""
         if not self.terms:
             raise FormulaError("a formula divides by zero")
         if len(self.terms) == 1:
             ((monomial, c),) = self.terms.items()
-            inverse = Fraction(1) / c
-            exact = int(inverse) if inverse.denominator == 1 else inverse
-            return Expr({(): exact}) * Expr({tuple((a, -n) for a, n in monomial): 1})
+            return Expr({(): _simplest(Fraction(1) / c)}) * Expr({tuple((a, -n) for a, n in monomial): 1})
         return Expr({((Atom("function", "sum", self), -1),): 1})
 
     # --- refused operations ---------------------------------------------------------------------------------
@@ -360,6 +378,49 @@ def _product(first: Monomial, second: Monomial) -> tuple[Monomial, Expr | None]:
     return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text)), more
 
 
+def _kept_product(first: Expr, second: Expr) -> Expr | None:
+    """Return a product in which sums stay factors, or None if it is expanded.
+
+    (x - c - 1)(x - c + 1)(x - c - 2) expanded would be a small difference of large numbers, as a power would.
+    Sums with velocities, sines or cosines are expanded (see `Expr._stays`), unless the other operand already
+    contains a power of the same sum.
+    """
+    if len(first.terms) < len(second.terms):
+        first, second = second, first
+    if len(first.terms) < 2 or not second.terms:
+        return None
+    if len(second.terms) > 1:
+        (shared, rest), (more, other) = first._divided(), second._divided()
+        if not (rest._is_factor() and other._is_factor()):
+            return None
+        base, factor = sorted((rest, other), key=lambda e: (len(e.text), e.text))
+        return _with_factor(_as_factor(base), factor) * (Expr({shared: 1}) * Expr({more: 1}))
+    (monomial,) = second.terms
+    sums = [(a.argument, n) for a, n in monomial if a.argument is not None and a.function == "sum"]
+    if not sums:
+        return None
+    shared, rest = first._divided()
+    joins = rest._is_factor() and any(n > 0 and e._is_factor() for e, n in sums)
+    if not joins and all(rest._ratio(e) is None for e, _ in sums):
+        return None
+    return _with_factor(second, rest) * Expr({shared: 1})
+
+
+def _as_factor(expr: Expr) -> Expr:
+    return Expr.of(Atom("function", "sum", expr))
+
+
+def _with_factor(product: Expr, factor: Expr) -> Expr:
+    """Return a product of kept sums times another sum; multiples of one sum make a power of it."""
+    (monomial,) = product.terms
+    for atom, _ in monomial:
+        if atom.argument is not None and atom.function == "sum":
+            ratio = factor._ratio(atom.argument)
+            if ratio is not None:
+                return product * Expr({((atom, 1),): ratio})
+    return product * _as_factor(factor)
+
+
 def _expanded(first: Expr, second: Expr) -> Expr:
     """Return the product of two expressions, term by term."""
     if len(first.terms) * len(second.terms) > LARGEST_PRODUCT:
@@ -387,7 +448,7 @@ def _closed(expr: Expr) -> Expr:
     """Return a long sum without velocities as one atom, so that products with it stay short."""
     if len(expr.terms) <= 8 or any(s.kind == "velocity" for s in expr.symbols()):
         return expr
-    return Expr({((Atom("function", "sum", expr), 1),): 1})
+    return _as_factor(expr)
 
 
 def function_of(name: str, argument: Any) -> Expr:
@@ -510,13 +571,13 @@ def derivative(expr: Expr, symbol: Atom) -> Expr:
             else:
                 if atom not in chain:
                     slope = derivative(atom.argument, symbol)
-                    chain[atom] = _slope(atom) * slope if slope.terms else slope
+                    chain[atom] = _expanded(_slope(atom), slope) if slope.terms else slope
                 inner = chain[atom]
                 if not inner.terms:
                     continue
             lower = ((atom, n - 1),) if n != 1 else ()
             rest = Expr({monomial[:i] + lower + monomial[i + 1 :]: c * n})
-            total = total + rest * inner
+            total = total + _expanded(rest, inner)  # so that terms of an equation can meet
     return total
 
 
