@@ -467,6 +467,8 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
             if (picture := still(task, *now, columns=columns)) is not None:
                 pictures.append(picture)
         title = f"{self.spec.id if self.spec else type(self.task).__name__} × {self.num_envs}"
+        if 0 < len(pictures) < self.num_envs:
+            title += f" (the first {len(pictures)} are shown)"
         spaces = {"observation of each": self.single_observation_space, "action": self.single_action_space}
         grid = tiled(pictures, columns) if pictures else None
         return environment_html(self.task, title, spaces, grid)
