@@ -228,7 +228,8 @@ def agent(policy: SubmittedPolicy) -> dict[str, Any] | None:
     return about | {
         "largest": head.largest,
         "choices": head.choices,
-        "arrays": {name: _array(x) for name, x in arrays.items()},
+        # Sorted, because safetensors reads them in any order, and pages are named by their content.
+        "arrays": {name: _array(arrays[name]) for name in sorted(arrays)},
     }
 
 
