@@ -95,6 +95,7 @@ def agrees(found, truth, times=4.0):
 # --- known parameters are recovered ---
 
 
+@pytest.mark.slow
 def test_without_noise():
     states, torques = swings()
     found = Pendulum().fit([(states, torques, DT)], ["mass", "length", "damping"])

@@ -318,6 +318,7 @@ class SwingingAtwood(scenes.Scene):
         return 9.81 * q.r * (2.5 - xp.cos(q.theta))
 
 
+@pytest.mark.slow
 def test_what_needs_short_substeps_once_is_not_paid_for_ever():
     """The rope nearly runs out at 0.084 s; after that substeps grow again."""
     scene, no_control = SwingingAtwood(), np.zeros((2, 0))

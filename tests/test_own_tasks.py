@@ -264,8 +264,15 @@ def test_refusal_after_a_kick_that_is_no_number(kind):
         env.step(env.action_space.sample())
 
 
-@pytest.mark.parametrize("kind", [own_tasks.Deliver, pivoted_bar.SwingUp])
-@pytest.mark.parametrize("imperfections", [{}, {"lag": 0.05}])
+@pytest.mark.parametrize(
+    ("kind", "imperfections"),
+    [
+        (own_tasks.Deliver, {}),
+        slow(own_tasks.Deliver, {"lag": 0.05}),
+        slow(pivoted_bar.SwingUp, {}),
+        (pivoted_bar.SwingUp, {"lag": 0.05}),
+    ],
+)
 def test_refusal_after_a_guard_that_is_no_number(kind, imperfections):
     def guard(self, wanted, before, dt, xp):
         name = self.scene.control_names[-1]
