@@ -217,6 +217,7 @@ def test_its_size_is_bounded_and_what_is_used_stays(place, monkeypatch):
     assert not left.exists()
 
 
+@pytest.mark.slow
 def test_processes_that_race(place):
     # All compile and write the same file, read it repeatedly, and damage it in between.
     code = """

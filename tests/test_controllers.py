@@ -360,6 +360,7 @@ def test_feedback_along_a_plan_holds_a_rest_without_control():
     assert planner.idle == pytest.approx(-0.6) and np.isfinite(blank.actions).all()
 
 
+@pytest.mark.slow
 def test_what_cannot_work_is_refused():
     with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 4\) for theta, theta_dot, psi_dot"):
         make_controller(SHELL, "LQR").predict(np.zeros(3))

@@ -103,6 +103,7 @@ def test_every_place_in_a_batch_has_the_same_bits():
             assert np.array_equal(a[lanes], few.reset(options={"reset_mask": mask[lanes]})[0])
 
 
+@pytest.mark.slow
 def test_a_refused_step_changes_no_command_and_no_reading():
     # Without rope the crane's mass matrix is singular.
     endless = {"id": "OwnSlack-v0", "terminated": Task.terminated}
@@ -384,6 +385,7 @@ def test_spaces_hold_all_that_may_be_drawn():
     assert (drawn >= np.max(ends, axis=0)).all()
 
 
+@pytest.mark.slow
 def test_what_the_space_cannot_hold_is_clipped_in_the_observation():
     class Narrow(TASKS["PivotedBar-v0"]):  # its bound is proved for a motion without pushes
         def bounds(self):

@@ -228,6 +228,7 @@ class Well(Scene):
         return {"x": u.force}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [1e4, 1e6])
 def test_at_rest_where_series_have_no_terms(stiffness):
     scene, dt, w = Well(stiffness=stiffness), 0.02, math.sqrt(stiffness)
@@ -261,6 +262,7 @@ class Brake(Scene):
         return {"x": -(u.brake + self.more) * xp.tanh(v.x / 0.01)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mass", "more"), [(1.0, 0.0), (1.0, 1e-12), (1.0, 1e-6), (1e9, 0.0), (1e-8, 0.0)])
 def test_what_is_multiplied_by_hardly_anything_has_its_derivatives(mass, more):
     """The brake that does not act changes the velocity by the integral of -tanh, from -2 to 0."""
