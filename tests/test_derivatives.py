@@ -124,7 +124,8 @@ def test_what_has_no_derivative():
     assert a.shape == (2, 2) and np.isfinite(p).all()
 
 
-@pytest.mark.parametrize("env_id", covering(of=way))
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", TASKS)
 def test_vjp_is_the_jacobian_transposed(env_id):
     """At rest, at moderate and at high speeds, where the step is divided."""
     scene, rng = TASKS[env_id]().scene, seeded(env_id)

@@ -111,7 +111,8 @@ def test_episodes_are_those_of_the_environments(kind, mode):
     assert ends > 2 * n
 
 
-@pytest.mark.parametrize("id", covering(PERFECT, engine))
+@pytest.mark.slow
+@pytest.mark.parametrize("id", PERFECT)
 def test_single_precision_is_the_step_to_its_rounding(id):
     """From the same states, at most 32 half units times size times condition."""
     n = 4

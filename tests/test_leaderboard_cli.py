@@ -216,6 +216,7 @@ def test_other_commands_do_not_load_the_leaderboard():
 # --- build, serve ---
 
 
+@pytest.mark.slow
 def test_build(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")
