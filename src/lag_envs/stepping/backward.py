@@ -163,7 +163,7 @@ class Backward(Series):
         return [x.last for x in found], [x.whole for x in found]
 
     def _sweep(self, t: Any, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list[Pair]:
-        """Return cotangents before the step, and what their last terms contribute."""
+        """Return cotangents before the step, each with an estimate of what it leaves out."""
         zero = t.number(0.0)
         first, per_order = following(t, order)
         self._clear(t, order)

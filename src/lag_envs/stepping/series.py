@@ -61,8 +61,9 @@ def following(t: Target, order: Any) -> tuple[Any, Any]:
 
     The last term counts with the first weight, each earlier one with the second times that of the next. A
     series of which 1e-13 is left out has terms that shrink by 1e-13^(1/(N+1)), which is 0.0172 (N - 6) within
-    5 % for N from 8 to 24. So much the next term is smaller than the last; if there are gaps, terms before
-    it tell. They count less, because terms shrink faster the later they come.
+    5 % for N from 8 to 24. The term that follows is smaller than the last by this factor. If the last terms
+    are 0 because the series has gaps, earlier ones count instead, with lower weights: later terms shrink
+    faster.
     """
     first = t.mul(t.number(0.0172), t.sub(t.real(order), t.number(6.0)))
     least = t.number(0.015)
