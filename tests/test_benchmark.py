@@ -29,7 +29,6 @@ from lag_envs.benchmark import (
     measurement,
 )
 from lag_envs.benchmark.actions import random_actions
-from lag_envs.benchmark.console import short
 from lag_envs.benchmark.environments import stagger_episodes
 from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.benchmark.peak import PRODUCTS
@@ -42,6 +41,7 @@ from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.compiling import count_operations, record_block
 from lag_envs.stepping.tracing import Trace
 from lag_envs.store import readable_json
+from lag_envs.tables import rate_text
 from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
 
 ID = pivoted_bar.SwingUpFree.id
@@ -531,7 +531,7 @@ def test_what_was_broken_off_is_not_taken_over(tmp_path, monkeypatch):
     ],
 )
 def test_rates_have_three_digits(value, text):
-    assert short(value) == text
+    assert rate_text(value) == text
 
 
 def test_episodes_are_spread_out():

@@ -1,5 +1,8 @@
 """The step for GPUs, compiled for the processor: against the unfused step, the environments, and itself."""
 
+import json
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +15,7 @@ from own_tasks import TASKS as OWN
 import lag_envs.torch
 from lag_envs import cli, nvrtc
 from lag_envs.benchmark import device as benchmark_device
+from lag_envs.benchmark import gpu
 from lag_envs.device import DeviceEnvs
 from lag_envs.envs.kernels import APART, kernels_of
 from lag_envs.envs.unfused import Unfused
@@ -275,15 +279,40 @@ def test_the_benchmark_measures_both_precisions(monkeypatch):
     """Here on the processor: its numbers say nothing about a GPU."""
     monkeypatch.setattr(benchmark_device, "DeviceEnvs", _on_any)
     monkeypatch.setattr(benchmark_device, "COPIED", 2**20)
-    found = benchmark_device.rates([CHOICES.id, BAR.id], [7], "cpu", 1e-3, 3)
-    assert [(r.id, r.dtype) for r in found] == [
-        (id, dtype) for id in (CHOICES.id, BAR.id) for dtype in (torch.float32, torch.float64)
+    report = benchmark_device.measured([CHOICES.id, BAR.id], [3, 7], torch.device("cpu"), 1e-3, 3)
+    assert [(r["id"], r["precision"], r["num_envs"]) for r in report["rows"]] == [
+        (id, precision, n)
+        for id in (CHOICES.id, BAR.id)
+        for precision in ("float32", "float64")
+        for n in (3, 7)
     ]
-    assert all(r.steps > 0.0 and r.share > 0.0 for r in found)
-    lines = benchmark_device.device_table(found).split("\n")
-    assert len(lines) == 5 and lines[1].split()[:3] == [CHOICES.id, "float32", "7"]
-    # State, its cosine and sine, control there and back, action, reward; two observations, age, three flags.
-    assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 7 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 3
+    assert report["bandwidth"] > 0.0
+    assert all(min(r["steps"], r["replayed"], r["share"]) > 0.0 for r in report["rows"])
+    # State, its cosine and sine, control there and back, action, reward; two observations, age, four flags.
+    assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 7 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 4
+
+
+def test_its_results_can_be_read(tmp_path):
+    rows = [
+        {"id": BAR.id, "precision": p, "num_envs": n, "steps": s * n, "replayed": 2 * s * n, "share": 0.25}
+        for p, s in (("float32", 3e4), ("float64", 1e4))
+        for n in (4, 2**20)
+    ]
+    report = {
+        "date": "2020-02-20", "gpu": "G", "versions": {"torch": "2"}, "bandwidth": 3e12, "rows": rows,
+        "settings": {"rounds": 9, "seconds": 0.05},
+    }  # fmt: skip
+    lines = gpu.console_lines(report)
+    assert "G, whose memory copies 3.00 TB/s" in lines[0] and len(lines) == 3 + len(rows)
+    assert lines[4].split() == [BAR.id, "float32", "1,048,576", "31.5", "G", "62.9", "G", "25%"]
+    (tmp_path / "docs").mkdir()
+    page = tmp_path / "docs" / "speed.md"
+    page.write_text("above <!-- gpu:begin --><!-- gpu:end --> below")
+    gpu.take_over(report, tmp_path)
+    assert json.loads((tmp_path / "docs" / "gpu.json").read_text()) == report
+    text = page.read_text()
+    assert "float32, 4 at once" in text and text.startswith("above") and text.endswith("below")
+    assert f"| {BAR.id} | 120 k | 240 k | 31.5 G | 25% | 10.5 G | 25% |" in text
 
 
 def _on_any(task, num_envs, device, dtype, **options):
@@ -304,24 +333,74 @@ def test_without_a_gpu(capsys):
     for given, message in (
         (["--device", "cuda"], "--device: there is no device 'cuda' here"),
         (["--device", "gpu"], "--device: device must be 'cpu' or 'cuda', got 'gpu'"),
-        (["--device", "cuda", "--cold"], "--device goes only with"),
+        (["--device", "cuda", "--cold"], "--device does not go with --cold"),
+        (["--device", "cuda", "--quick", "--checkout", "."], "leave out IDs, --quick"),
     ):
         assert cli.main(["bench", *given]) == 2
         assert message in capsys.readouterr().err
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
-@pytest.mark.parametrize("id", covering(PERFECT, engine))
+def on_gpu(test):
+    """Mark a test that needs a GPU."""
+    return pytest.mark.gpu(pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")(test))
+
+
+def sampled(envs, task, count):
+    """Return random actions of a batch, on the CPU."""
+    envs.action_space.seed(0)
+    return [actions_of(task, envs.action_space.sample()) for _ in range(count)]
+
+
+@on_gpu
+@pytest.mark.parametrize("kind", [*covering(PERFECT, engine), *map(slow, OWN)], ids=str)
 @pytest.mark.parametrize("mode", MODES[:2])
-def test_a_gpu_has_the_same_bits(id, mode):
-    there = TorchVectorEnv(id, 1000, device="cuda", autoreset_mode=mode)
-    here = on_processor(id, 1000, autoreset_mode=mode)
+def test_a_gpu_has_the_same_bits(kind, mode):
+    there = TorchVectorEnv(kind, 1000, device="cuda", autoreset_mode=mode)
+    here = on_processor(kind, 1000, autoreset_mode=mode)
     assert torch.equal(there.reset(seed=1)[0].cpu(), here.reset(seed=1))
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        there.action_space.seed(int(rng.integers(2**31)))
-        actions = actions_of(here.task, there.action_space.sample())
+    for actions in sampled(there, here.task, 100):
         found, expected = there.step(actions.cuda()), here.step(actions)
         assert all(torch.equal(a.cpu(), b) for a, b in zip(found[:4], expected[:4], strict=True))
+        assert found[4].keys() == expected[4].keys()
+        assert all(torch.equal(found[4][name].cpu(), expected[4][name]) for name in expected[4])
         assert torch.equal(there.state.cpu(), here.state)
+
+
+@on_gpu
+@pytest.mark.parametrize("id", covering(PERFECT, engine))
+def test_a_gpus_single_precision_is_the_processors_to_rounding(id):
+    """Its sines and products differ in the last bit. Each step starts from the same numbers."""
+    there = TorchVectorEnv(id, 1000, device="cuda", dtype=torch.float32, autoreset_mode="SameStep")
+    here = on_processor(id, 1000, dtype=torch.float32, autoreset_mode="SameStep")
+    assert torch.allclose(there.reset(seed=1)[0].cpu(), here.reset(seed=1), rtol=1e-6, atol=1e-6)
+    for actions in sampled(there, here.task, 100):
+        here.rows.copy_(there.envs.rows)
+        found, expected = there.step(actions.cuda()), here.step(actions)
+        assert not found[4]["refused"].any()
+        assert (found[2].cpu() == expected[2]).float().mean() > 0.99  # some states are at the edge
+        same = found[2].cpu() == expected[2]
+        off = (there.state.cpu() - here.state).abs() / here.state.abs().amax(dim=0).clamp(min=1.0)
+        assert off[same].median() < 1e-6 and off[same].max() < 1e-3
+
+
+@on_gpu
+def test_a_gpus_steps_may_be_recorded_in_a_graph_and_run_in_any_stream_and_thread():
+    envs = TorchVectorEnv(BAR.id, 1000, device="cuda", autoreset_mode="SameStep")
+    other = TorchVectorEnv(BAR.id, 1000, device="cuda", autoreset_mode="SameStep")
+    actions = torch.rand(1000, 1, dtype=torch.float64, device="cuda") * 2 - 1
+    for one in (envs, other):
+        one.reset(seed=1)
+        one.step(actions)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        recorded = envs.step(actions)
+    side = torch.cuda.Stream()
+    with ThreadPoolExecutor(1) as pool:
+        for _ in range(30):
+            graph.replay()
+            with torch.cuda.stream(side):
+                found = pool.submit(other.step, actions).result()
+            side.synchronize()
+            torch.cuda.synchronize()
+            assert all(torch.equal(a, b) for a, b in zip(found[:4], recorded[:4], strict=True))
+    assert torch.equal(envs.state, other.state)

@@ -64,7 +64,7 @@ class Module:
         self._driver, _ = _bindings()
         self._context = _checked(self._driver.cuCtxGetCurrent())
         self._module = _checked(self._driver.cuModuleLoadData(code))
-        self._kernels: dict[str, Any] = {}
+        self._kernels: dict[str, tuple[Any, Any, Any]] = {}
 
     def launch(self, name: str, count: int, stream: int, arguments: Sequence[int]) -> None:
         """Start a kernel, with one thread for each of `count` environments.
@@ -81,12 +81,17 @@ class Module:
             Addresses and 64-bit integers.
         """
         if name not in self._kernels:
-            self._kernels[name] = _checked(self._driver.cuModuleGetFunction(self._module, name.encode()))
-        given = tuple(arguments), (ctypes.c_longlong,) * len(arguments)
+            kernel = _checked(self._driver.cuModuleGetFunction(self._module, name.encode()))
+            numbers = (ctypes.c_longlong * len(arguments))()
+            places = [ctypes.addressof(numbers) + 8 * i for i in range(len(arguments))]
+            self._kernels[name] = kernel, numbers, (ctypes.c_void_p * len(arguments))(*places)
+        kernel, numbers, places = self._kernels[name]
+        numbers[:] = arguments  # the launch copies them
         grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
         _checked(self._driver.cuCtxPushCurrent(self._context))  # another thread may not have a context
         try:
-            _checked(self._driver.cuLaunchKernel(self._kernels[name], *grid, *block, 0, stream, given, 0))
+            given = ctypes.addressof(places)
+            _checked(self._driver.cuLaunchKernel(kernel, *grid, *block, 0, stream, given, 0))
         finally:
             _checked(self._driver.cuCtxPopCurrent())
 

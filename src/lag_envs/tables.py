@@ -69,3 +69,18 @@ def number_text(value: float) -> str:
     return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value + 0.0:.5g}").replace(
         "1e5", "100000"
     )
+
+
+def rate_text(value: float) -> str:
+    """Return a rate with three digits.
+
+    Examples
+    --------
+    >>> rate_text(1234.0), rate_text(41_234_567.0)
+    ('1.23 k', '41.2 M')
+    """
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= 0.9995 * size:
+            value /= size
+            return f"{value:.{max(0, 2 - (value >= 9.995) - (value >= 99.95))}f} {unit}"
+    return f"{value:.0f}"

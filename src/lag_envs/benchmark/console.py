@@ -7,7 +7,7 @@ from typing import Any
 from lag_envs.benchmark import divisions, jacobians
 from lag_envs.benchmark.chain_costs import cost_table, growth
 from lag_envs.benchmark.results import quartiles, times_of
-from lag_envs.tables import aligned
+from lag_envs.tables import aligned, rate_text
 
 
 def report_lines(report: dict[str, Any]) -> list[str]:
@@ -66,27 +66,17 @@ def report_lines(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def short(value: float) -> str:
-    """Return a rate with three digits.
-
-    Examples
-    --------
-    >>> short(1234.0), short(41_234_567.0)
-    ('1.23 k', '41.2 M')
-    """
-    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if value >= 0.9995 * size:
-            value /= size
-            return f"{value:.{max(0, 2 - (value >= 9.995) - (value >= 99.95))}f} {unit}"
-    return f"{value:.0f}"
-
-
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     name = (row["library"], row["id"], row["kind"], f"{row['num_envs']:,}")
     if "steps_per_second" not in row:
         return (*name, row["problem"] or "not measured")
     low, middle, high = row["steps_per_second"]
-    cells: tuple[str, ...] = (*name, short(middle), f"({short(low)} - {short(high)})", f"{1e9 / middle:,.1f}")
+    cells: tuple[str, ...] = (
+        *name,
+        rate_text(middle),
+        f"({rate_text(low)} - {rate_text(high)})",
+        f"{1e9 / middle:,.1f}",
+    )
     if "ratio" in row:
         low, middle, high = row["ratio"]
         cells = (*cells, f"{middle:.2f}", f"({low:.2f} - {high:.2f})")

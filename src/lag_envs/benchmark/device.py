@@ -1,7 +1,8 @@
 """How fast a GPU steps environments: the command ``lag-envs bench --device cuda``.
 
 The rate is that of whole steps as in training: control, motion, reward, observation, ending, kick and
-restarts. Beside it stands the data that the step has to read and write, as a share of the memory's rate,
+restarts. It is measured twice: calling `step`, and replaying a CUDA graph of it, which leaves out Python's
+share. Beside the latter stands the data that a step has to read and write, as a share of the memory's rate,
 which is measured by copying in the same run.
 """
 
@@ -11,47 +12,23 @@ import time
 from collections.abc import Callable, Sequence
 from itertools import product
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
 from lag_envs.device import DeviceEnvs
-from lag_envs.tables import aligned
+from lag_envs.progress import progress
 
 #: Numbers copied to measure the memory, more than any cache holds.
 COPIED = 2**28
-#: Bytes of an environment besides its numbers: its age, read and written, and three booleans.
-FLAGS = 4 + 4 + 3
+#: Bytes of an environment besides its numbers: its age, read and written, and four booleans.
+FLAGS = 4 + 4 + 4
 
 
-class DeviceRate(NamedTuple):
-    """Measurement of one environment.
-
-    Attributes
-    ----------
-    id : str
-        The environment.
-    dtype : torch.dtype
-        Precision of its numbers.
-    num_envs : int
-        How many environments step together.
-    steps : float
-        Steps per second of all of them together.
-    share : float
-        Data that they read and write, as a share of what the memory can transfer.
-    """
-
-    id: str
-    dtype: torch.dtype
-    num_envs: int
-    steps: float
-    share: float
-
-
-def rates(
-    ids: Sequence[str], sizes: Sequence[int], device: str | torch.device, seconds: float, rounds: int
-) -> list[DeviceRate]:
+def measured(
+    ids: Sequence[str], sizes: Sequence[int], device: torch.device, seconds: float, rounds: int
+) -> dict[str, Any]:
     """Measure environments on a GPU, in single and in double precision.
 
     Parameters
@@ -60,21 +37,48 @@ def rates(
         Environments without imperfections.
     sizes : sequence of int
         Numbers of environments.
-    device : str or torch.device
+    device : torch.device
         The GPU.
     seconds : float
         Target length of a sample.
     rounds : int
         Samples of each; the median counts.
+
+    Returns
+    -------
+    dict
+        ``gpu``, its name; ``settings``; ``bandwidth``, the bytes a second that copying reads and writes; and
+        ``rows``. A row has ``id``, ``precision`` and ``num_envs``; ``steps`` and ``replayed``, the steps a
+        second of all environments together, when `step` is called and in a CUDA graph; and ``share``, the
+        data of the latter as a share of the bandwidth.
     """
-    bandwidth = _bandwidth(device, seconds, rounds)
-    found = []
-    for env_id, dtype, size in product(ids, (torch.float32, torch.float64), sizes):
-        envs = DeviceEnvs(env_id, size, device, dtype, autoreset_mode="SameStep")
-        envs.reset(seed=0)
-        steps = size * _calls_a_second(_stepping(envs), envs.device, seconds, rounds)
-        found.append(DeviceRate(env_id, dtype, size, steps, steps * traffic(envs) / bandwidth))
-    return found
+
+    def calls_a_second(run: Callable[[], Any]) -> float:
+        return _calls_a_second(run, device, seconds, rounds)
+
+    bandwidth = 2 * 4 * COPIED * calls_a_second(_copying(device))
+    rows = []
+    cases = list(product(ids, (torch.float32, torch.float64), sizes))
+    with progress(len(cases)) as advance:
+        for env_id, dtype, size in cases:
+            envs = DeviceEnvs(env_id, size, device, dtype, autoreset_mode="SameStep")
+            envs.reset(seed=0)
+            step = _stepping(envs)
+            replayed = size * calls_a_second(_in_graph(step, device))
+            rows.append(
+                {
+                    "id": env_id,
+                    "precision": str(dtype).removeprefix("torch."),
+                    "num_envs": size,
+                    "steps": size * calls_a_second(step),
+                    "replayed": replayed,
+                    "share": replayed * traffic(envs) / bandwidth,
+                }
+            )
+            advance(env_id)
+    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else "none"
+    settings = {"sizes": list(sizes), "seconds": seconds, "rounds": rounds}
+    return {"gpu": gpu, "settings": settings, "bandwidth": bandwidth, "rows": rows}
 
 
 def traffic(envs: DeviceEnvs) -> int:
@@ -85,21 +89,10 @@ def traffic(envs: DeviceEnvs) -> int:
     return number * (2 * kept + actions + 1) + 2 * 4 * seen + FLAGS
 
 
-def device_table(found: Sequence[DeviceRate]) -> str:
-    """Return the measurements as text."""
-    head = ("environment", "precision", "environments", "steps/s", "share of memory's rate")
-    rows = [
-        (r.id, str(r.dtype).removeprefix("torch."), f"{r.num_envs:,}", f"{r.steps:.3g}", f"{r.share:.0%}")
-        for r in found
-    ]
-    return "\n".join(aligned([head, *rows]))
-
-
-def _bandwidth(device: str | torch.device, seconds: float, rounds: int) -> float:
-    """Return the bytes per second that copying reads and writes."""
-    memory = torch.empty(COPIED, dtype=torch.float32, device=device)
-    copy = torch.empty_like(memory)
-    return 2 * memory.nbytes * _calls_a_second(lambda: copy.copy_(memory), memory.device, seconds, rounds)
+def _copying(device: torch.device) -> Callable[[], Any]:
+    """Return a function that copies numbers from one place of the memory to another."""
+    numbers, copy = torch.empty(2, COPIED, dtype=torch.float32, device=device)
+    return lambda: copy.copy_(numbers)
 
 
 def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
@@ -111,6 +104,16 @@ def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
     if actions.is_floating_point():
         actions = actions.to(envs.dtype)
     return lambda: envs.step(actions)
+
+
+def _in_graph(step: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
+    """Return a function that replays a step recorded in a CUDA graph; without a GPU, the step itself."""
+    if device.type != "cuda":
+        return step
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        step()
+    return graph.replay
 
 
 def _calls_a_second(run: Callable[[], Any], device: torch.device, seconds: float, rounds: int) -> float:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
-from lag_envs import TASKS
+from lag_envs import TASKS, __version__
 from lag_envs.commands.base import (
     OWN_OR_MODULE,
     Command,
@@ -16,9 +17,10 @@ from lag_envs.commands.base import (
     seconds,
 )
 from lag_envs.errors import UserError
-from lag_envs.host import usable_cores
+from lag_envs.host import installed_versions, machine, usable_cores
 from lag_envs.options import count, new_file
 from lag_envs.own_files import is_file
+from lag_envs.store import readable_json, write_file
 
 
 def declare_bench(parser: argparse.ArgumentParser) -> None:
@@ -134,11 +136,15 @@ def run_bench(args: argparse.Namespace) -> int:
 
 def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     """Measure on a GPU."""
-    others = ("cold", "checkout", "keywords", "output")
-    if args.threads > 1 or args.clock == "cpu" or any(getattr(args, name) for name in others):
-        raise UserError("--device goes only with --quick, --sizes, --rounds, --seconds; leave out the others")
+    if args.threads > 1 or args.clock == "cpu" or args.cold or args.keywords:
+        raise UserError("--device does not go with --cold, --with, --threads, --clock cpu: leave them out")
+    if args.checkout is not None:
+        if args.ids or args.quick:
+            raise UserError("--checkout writes a whole measurement into a checkout: leave out IDs, --quick")
+        check_checkout("--checkout", args.checkout)
     needs("torch", "torch")
-    from lag_envs.benchmark.device import device_table, rates
+    from lag_envs.benchmark import gpu
+    from lag_envs.benchmark.device import measured
     from lag_envs.device import checked_device
 
     try:
@@ -146,8 +152,21 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     except ValueError as error:
         raise UserError(f"--device: {error}") from error
     perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
-    found = rates(perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.2, args.rounds or 9)
-    print(device_table(found))
+    about = {
+        "date": args.date,
+        "machine": machine(),
+        "versions": {"lag_envs": __version__} | installed_versions(["torch"]),
+    }
+    report = about | measured(
+        perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.05, args.rounds or 9
+    )
+    print("\n".join(gpu.console_lines(report)))
+    if args.output:
+        write_file(args.output, readable_json(report))
+        print(f"written to {args.output}")
+    if args.checkout is not None:
+        gpu.take_over(report, Path(args.checkout))
+        print(f"written to docs/gpu.json and docs/speed.md in {args.checkout}")
     return 0
 
 
@@ -208,7 +227,7 @@ examples:
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
   lag-envs bench --quick --with action_delay=0.013   the cost of keywords
   lag-envs bench --quick --threads 2                 the gain from a second thread
-  lag-envs bench --quick --device cuda               on a GPU, in both precisions
+  lag-envs bench --device cuda                       on a GPU, in both precisions
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that is busy with other work""",
     declare_bench,

@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lag_envs.benchmark import gpu
 from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.options import module_parser
 from lag_envs.report import overview, page
@@ -143,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def update(project: Path) -> None:
-    """Write the files that depend on ``docs/accuracy.json`` and ``docs/speed.json``: pages, first figure."""
+    """Write the files that depend on the JSON files in docs: pages, first figure."""
     for path, text in generated(project).items():
         write_file(path, text)
     accuracy = json.loads((project / "docs" / "accuracy.json").read_text(encoding="utf-8"))
@@ -154,12 +155,15 @@ def update(project: Path) -> None:
 
 def generated(project: Path) -> dict[Path, str]:
     """Return the generated files as they should be."""
-    accuracy, speed = (
-        json.loads((project / "docs" / name).read_text(encoding="utf-8"))
-        for name in ("accuracy.json", "speed.json")
+    docs = project / "docs"
+    accuracy, speed, on_gpu = (
+        json.loads((docs / name).read_text(encoding="utf-8"))
+        for name in ("accuracy.json", "speed.json", "gpu.json")
     )
-    pages = {"accuracy.md": accuracy_markdown(accuracy), DETAILS: details(accuracy)}
-    return {project / "docs" / name: text for name, text in pages.items()} | speed_texts(speed, project)
+    found = {docs / "accuracy.md": accuracy_markdown(accuracy), docs / DETAILS: details(accuracy)}
+    found |= speed_texts(speed, project)
+    found[docs / "speed.md"] = gpu.with_table(found[docs / "speed.md"], on_gpu)
+    return found
 
 
 def drawn_figure(picture: ReportFigure, folder: Path) -> Path:
