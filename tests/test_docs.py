@@ -462,6 +462,21 @@ def test_speeds():
     assert found["PivotedBar-v0", TARGETS[0].kind, 1]["ratio"][1] > 5.0
 
 
+def test_speeds_on_a_gpu():
+    """Prose claims no more than was measured."""
+    measured = json.loads((ROOT / "docs" / "gpu.json").read_text(encoding="utf-8"))
+    rows = {(row["id"], row["precision"], row["num_envs"]): row for row in measured["rows"]}
+    single, double = (rows["PivotedBar-v0", precision, 2**20] for precision in ("float32", "float64"))
+    assert "H100" in measured["gpu"] and single["steps"] >= 20e9 and double["steps"] >= 10e9
+    usage, readme, changes = (
+        (ROOT / name).read_text(encoding="utf-8") for name in ("docs/usage.md", "README.md", "CHANGELOG.md")
+    )
+    assert "take 20 billion steps a second in float32 and 10 billion in float64" in usage
+    assert f"{100 * single['share']:.0f} % of what the memory can copy" in usage
+    assert "20 billion steps a second" in readme and "20 billion steps a second" in changes
+    assert {id for id, *_ in rows} <= set(TASKS)
+
+
 def test_numbers_in_the_prose():
     """Statements on pages about the code's own numbers are true."""
     weight = motion_constants_of(make(pivoted_bar.SwingUpFree.id).scene)["alpha"]

@@ -304,7 +304,7 @@ def test_its_results_can_be_read(tmp_path):
     }  # fmt: skip
     lines = gpu.console_lines(report)
     assert "G, whose memory copies 3.00 TB/s" in lines[0] and len(lines) == 3 + len(rows)
-    assert lines[4].split() == [BAR.id, "float32", "1,048,576", "31.5", "G", "62.9", "G", "25%"]
+    assert lines[4].split() == [BAR.id, "float32", "1,048,576", "31.5", "G", "62.9", "G", "25", "%"]
     (tmp_path / "docs").mkdir()
     page = tmp_path / "docs" / "speed.md"
     page.write_text("above <!-- gpu:begin --><!-- gpu:end --> below")
@@ -312,7 +312,7 @@ def test_its_results_can_be_read(tmp_path):
     assert json.loads((tmp_path / "docs" / "gpu.json").read_text()) == report
     text = page.read_text()
     assert "float32, 4 at once" in text and text.startswith("above") and text.endswith("below")
-    assert f"| {BAR.id} | 120 k | 240 k | 31.5 G | 25% | 10.5 G | 25% |" in text
+    assert f"| {BAR.id} | 120 k | 240 k | 31.5 G | 25 % | 10.5 G | 25 % |" in text
 
 
 def _on_any(task, num_envs, device, dtype, **options):

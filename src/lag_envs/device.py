@@ -47,6 +47,8 @@ class DeviceEnvs:
     ----------
     rows : Tensor, shape (n_rows, num_envs)
         The numbers kept of the environments, including states, targets and controls.
+    ages : Tensor of int32, shape (num_envs,)
+        Steps taken in the present episodes; negative where an episode is over.
 
     Raises
     ------
@@ -100,7 +102,7 @@ class DeviceEnvs:
         self._targets, self._controls = kernels.targets, kernels.controls
         self.rows = self._new(kernels.kept, dtype=dtype).zero_()
         self._ids = self._new(2, dtype=torch.int64).zero_()
-        self._ages = self._new(dtype=torch.int32).zero_()
+        self.ages = self._new(dtype=torch.int32).zero_()
         self._constants = torch.tensor(kernels.constants, dtype=dtype, device=self.device)
         self._started = False
 
@@ -145,7 +147,7 @@ class DeviceEnvs:
             self._ids[1, lanes[chosen]] = 0
         observations = self._new(len(self.task.observation), dtype=torch.float32)
         self._launch(
-            "begin", self.num_envs, self.rows, self._ids, self._ages, self._constants,
+            "begin", self.num_envs, self.rows, self._ids, self.ages, self._constants,
             mask, states, goals, observations,
         )  # fmt: skip
         self._started = True
@@ -167,7 +169,7 @@ class DeviceEnvs:
         if not self._started:
             raise ResetNeeded("call reset() before step(): no episode has begun")
         mode = self.sample.autoreset_mode
-        if mode == AutoresetMode.DISABLED and bool((self._ages < 0).any()):
+        if mode == AutoresetMode.DISABLED and bool((self.ages < 0).any()):
             raise ResetNeeded("episodes are over: reset their environments with options['reset_mask']")
         same_step = mode == AutoresetMode.SAME_STEP
         # A GPU's step is so short that each allocation counts.
@@ -175,7 +177,7 @@ class DeviceEnvs:
         rewards = self._new(dtype=self.dtype)
         flags = self._new(3 + same_step, dtype=torch.bool)
         self._launch(
-            "step", self.num_envs, self.rows, self._ids, self._ages, self._constants, self._limit,
+            "step", self.num_envs, self.rows, self._ids, self.ages, self._constants, self._limit,
             int(same_step), actions.detach().to(self.dtype).contiguous(), observations, rewards, flags,
         )  # fmt: skip
         seen, *last = observations.mT.unbind()

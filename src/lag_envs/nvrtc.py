@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 #: Threads per block: each has a whole environment in its registers, so few blocks fit at once.
-BLOCK = 128
+BLOCK = 64
 
 
 def version() -> tuple[int, int]:

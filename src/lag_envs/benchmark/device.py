@@ -1,9 +1,9 @@
 """How fast a GPU steps environments: the command ``lag-envs bench --device cuda``.
 
 The rate is that of whole steps as in training: control, motion, reward, observation, ending, kick and
-restarts. It is measured twice: calling `step`, and replaying a CUDA graph of it, which leaves out Python's
-share. Beside the latter stands the data that a step has to read and write, as a share of the memory's rate,
-which is measured by copying in the same run.
+restarts, in environments that are in the midst of their episodes. It is measured twice: calling `step`, and
+replaying a CUDA graph of it, which leaves out Python's share. Beside the latter stands the data that a step
+has to read and write, as a share of the memory's rate, which is measured by copying in the same run.
 """
 
 from __future__ import annotations
@@ -24,6 +24,10 @@ from lag_envs.progress import progress
 COPIED = 2**28
 #: Bytes of an environment besides its numbers: its age, read and written, and four booleans.
 FLAGS = 4 + 4 + 4
+#: Environments that go through an episode before a measurement, to provide states, and its maximum length.
+FEW, LONGEST = 4096, 1000
+#: Batches of random actions, used in turn.
+BATCHES = 4
 
 
 def measured(
@@ -61,16 +65,15 @@ def measured(
     cases = list(product(ids, (torch.float32, torch.float64), sizes))
     with progress(len(cases)) as advance:
         for env_id, dtype, size in cases:
-            envs = DeviceEnvs(env_id, size, device, dtype, autoreset_mode="SameStep")
-            envs.reset(seed=0)
-            step = _stepping(envs)
-            replayed = size * calls_a_second(_in_graph(step, device))
+            envs = _under_way(env_id, size, device, dtype)
+            run = _stepping(envs)
+            replayed = BATCHES * size * calls_a_second(_in_graph(run, device))
             rows.append(
                 {
                     "id": env_id,
                     "precision": str(dtype).removeprefix("torch."),
                     "num_envs": size,
-                    "steps": size * calls_a_second(step),
+                    "steps": BATCHES * size * calls_a_second(run),
                     "replayed": replayed,
                     "share": replayed * traffic(envs) / bandwidth,
                 }
@@ -95,24 +98,47 @@ def _copying(device: torch.device) -> Callable[[], Any]:
     return lambda: copy.copy_(numbers)
 
 
+def _under_way(env_id: str, size: int, device: torch.device, dtype: torch.dtype) -> DeviceEnvs:
+    """Return environments at all times of their episodes, with the states that random actions lead to."""
+    few, envs = (
+        DeviceEnvs(env_id, n, device, dtype, autoreset_mode="SameStep") for n in (min(size, FEW), size)
+    )
+    few.reset(seed=0)
+    envs.reset(seed=0)
+    length = int(min(few.task.limit, LONGEST))
+    few.ages.random_(length)
+    run = _stepping(few)
+    for _ in range(0, length, BATCHES):
+        run()
+    for given, found in ((envs.rows, few.rows), (envs.ages, few.ages)):
+        copies = found.repeat(*[1] * (found.ndim - 1), -(-size // few.num_envs))
+        given.copy_(copies[..., :size])
+    return envs
+
+
 def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
-    """Return a function that takes a step with random actions made beforehand."""
+    """Return a function that takes steps with random actions made beforehand."""
     space = envs.sample.single_action_space
     space.seed(0)
     sample = torch.as_tensor(np.array([space.sample() for _ in range(1000)]), device=envs.device)
-    actions = sample[torch.randint(len(sample), (envs.num_envs,), device=envs.device)]
-    if actions.is_floating_point():
-        actions = actions.to(envs.dtype)
-    return lambda: envs.step(actions)
+    if sample.is_floating_point():
+        sample = sample.to(envs.dtype)
+    actions = sample[torch.randint(len(sample), (BATCHES, envs.num_envs), device=envs.device)].unbind()
+
+    def run() -> None:
+        for batch in actions:
+            envs.step(batch)
+
+    return run
 
 
-def _in_graph(step: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
-    """Return a function that replays a step recorded in a CUDA graph; without a GPU, the step itself."""
+def _in_graph(run: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
+    """Return a function that replays steps recorded in a CUDA graph; without a GPU, the steps."""
     if device.type != "cuda":
-        return step
+        return run
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        step()
+        run()
     return graph.replay
 
 
@@ -131,6 +157,6 @@ def _calls_a_second(run: Callable[[], Any], device: torch.device, seconds: float
         wait()
         return (time.perf_counter() - begun) / count
 
-    sample(3)
-    count = max(1, round(seconds / sample(3)))
+    sample(1)
+    count = max(1, round(seconds / sample(1)))
     return 1.0 / median(sample(count) for _ in range(rounds))

@@ -27,7 +27,7 @@ def console_lines(report: dict[str, Any]) -> list[str]:
             f"{row['num_envs']:,}",
             rate_text(row["steps"]),
             rate_text(row["replayed"]),
-            f"{row['share']:.0%}",
+            share(row),
         )
         for row in report["rows"]
     ]
@@ -42,7 +42,7 @@ def gpu_markdown(report: dict[str, Any]) -> str:
 
     def cells(id: str) -> list[str]:
         alone, *both = (rows[id, p, n] for p, n in (("float32", few), ("float32", many), ("float64", many)))
-        large = [cell for row in both for cell in (rate_text(row["steps"]), f"{row['share']:.0%}")]
+        large = [cell for row in both for cell in (rate_text(row["steps"]), share(row))]
         return [id, rate_text(alone["steps"]), rate_text(alone["replayed"]), *large]
 
     head = (
@@ -67,6 +67,11 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
 def with_table(page: str, report: dict[str, Any]) -> str:
     """Return the text of docs/speed.md with a report's table."""
     return replaced(page, "gpu", gpu_markdown(report))
+
+
+def share(row: dict[str, Any]) -> str:
+    """Return a share of the memory's rate as text."""
+    return f"{100 * row['share']:.0f} %"
 
 
 def _about(report: dict[str, Any]) -> str:
