@@ -8,10 +8,11 @@ from typing import Any
 from lag_envs.benchmark import divisions
 from lag_envs.benchmark.chain_costs import Costs, cost_table, growth, write_figure
 from lag_envs.benchmark.results import times_of
+from lag_envs.benchmark.rounds import CORE
 from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, SpeedTarget, has_own_flow, reached_targets
 from lag_envs.generated import replaced
 from lag_envs.store import readable_json, write_file
-from lag_envs.tables import markdown_table
+from lag_envs.tables import markdown_table, rate_text
 
 #: The picture of chains' costs, in docs.
 CHAINS = Path("images", "chains.svg")
@@ -68,10 +69,12 @@ def speed_markdown(report: dict[str, Any]) -> str:
         ["*target*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
     ]
     machine, settings = report["machine"], report["settings"]
+    peaks = [row["steps_per_second"][1] for row in report["rows"] if row["library"] == CORE and row["rates"]]
+    peak = f", which adds {rate_text(peaks[0])} products a second" if peaks else ""
     parts = [
         "Time of a step, also as a multiple of the time of Gymnasium's `CartPole-v1` for as many "
         f"environments: medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "
-        f"{machine['processor']} (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, "
+        f"{machine['processor']}{peak} (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, "
         f"{report['date']}).",
         markdown_table(["id", *sizes], lines),
     ]

@@ -272,11 +272,12 @@ def _compile_lengths() -> tuple[Callable, Callable]:
     return enough_of, next_length
 
 
-def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
+def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order, allowed):  # type: ignore[no-untyped-def]
     """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
 
-    No substep is longer than its lane's entry of `longest`. Where that was too long for the derivatives, a
-    smaller one takes its place, and what was found for the lane is of no use.
+    No substep leaves out more than `allowed`, see `TOLERANCE`, or is longer than its lane's entry of
+    `longest`. Where that was too long for the derivatives, a smaller one takes its place, and what was found
+    for the lane is of no use.
 
     Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
@@ -331,7 +332,7 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
             put(before[2 * n], table[left], BLOCK)
             still = 0
             for begin in range(0, going, LANES):
-                back = pull(rows, begin, dt, order, tolerance) > 0
+                back = pull(rows, begin, dt, order, allowed) > 0
                 until = min(begin + LANES, going)
                 if back:
                     for r in range(wanted):
@@ -414,7 +415,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
-    """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
+    """Compile ``pull_all(given, cotangents, found, ..., allowed)``, see `_pull_all` and `compile_pull`."""
     width = lanes(record)
     numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))

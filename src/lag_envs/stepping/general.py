@@ -30,6 +30,9 @@ from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE
 
 #: How many terms more the series of derivatives has.
 FURTHER = 1
+#: What a substep may leave out of the motion, as a part of `TOLERANCE`, where it left out too much of the
+#: derivatives; and from the beginning where a function is steep, since derivatives then leave out far more.
+STRICTER, STEEP = 1e-3, {"atan", "tanh"}
 
 
 class SeriesStepper:
@@ -352,11 +355,13 @@ class SeriesTangent:
         given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
         found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
         some = np.arange(len(states))
+        strict = any(node.op in STEEP for node in self._record.nodes)
         while len(some):  # again those whose substeps were too long for the derivatives
             every = len(some) == len(states)
             shorter, pulled = longest[some], found if every else np.empty((self._width, len(some)))
             parts = (given, seeds) if every else (given[:, some].copy(), seeds[:, some].copy())
-            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further):
+            tolerance = TOLERANCE * (STRICTER if strict else 1.0)
+            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further, tolerance):
                 # Substeps backwards are no longer than the shortest of the step. Forwards they grow again.
                 i = some[refused - 1 : refused]
                 slopes, refused = self.jacobian(states[i], controls[i], dt, order)
@@ -368,8 +373,9 @@ class SeriesTangent:
             if not every:
                 found[:, some] = pulled
             too_long = shorter < longest[some]
-            longest[some] = shorter
-            some = some[too_long]
+            if strict:
+                longest[some] = shorter
+            some, strict = some[too_long], True
         return found.T, 0
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
