@@ -14,10 +14,10 @@ from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 from own_tasks import Switched
 from test_policies import EVERY as LATER
-from test_policies import LISTED, LISTS, numbers
+from test_policies import LISTED, LISTS, TwoLists, numbers
 from test_policies import OWN as LATER_TASKS
 
-from lag_envs import cli, replay
+from lag_envs import cli, register, replay
 from lag_envs.controllers import controllers
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import SubmittedPolicy, architecture
@@ -775,6 +775,43 @@ def test_ghosts_run_beside(drive, haunted):
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
     until(page, "document.activeElement.className === 'stage'")
+
+
+class Everything(TwoLists):
+    """Two controls from lists, noise, hidden parameters, a delay."""
+
+    id = "Everything-v0"
+    imperfections = {
+        "randomize": {"mass_2": (0.5, 2.0)},
+        "observation_noise": 0.02,
+        "action_delay": 0.02,
+    }
+
+
+def test_one_record_with_everything(drive, monkeypatch, tmp_path):
+    """A page needs only its record: two lists of actions, noise, hidden parameters, a delay, a memory."""
+    monkeypatch.setitem(TASKS.data, Everything.id, Everything)
+    register(Everything)
+    remembers = made(Everything.id, {"architecture": "gru", "memory": 5}, None)
+    board = {"id": Everything.id, "rows": [{"name": "Remembers", "agent": agent(remembers)}]}
+    write_page({"protocol": 1, "made": "today", "environments": [board]}, tmp_path)
+    page = drive(Everything.id, folder=tmp_path, bypass_csp=True)
+    task = Everything()
+    check_bits(page, tmp_path, task, Everything.id, [(seed, at_random(task, seed)) for seed in (3, 2**63)])
+    assert "1 to 3 for that action of every list" in message(page)
+    page.select_option(".drive-controls select >> nth=1", "live:0")
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    page.keyboard.down("3")
+    shows(page, "shoulder", "5.00 N m")
+    page.keyboard.up("3")
+    until(page, "document.querySelector('.message').textContent.startsWith('Time is up')")
+    assert float(reading(page, "Ghost's return").replace("−", "-"))
+    found = replay.replay(replay.read_link(link_of(page)))
+    assert found.true and found.finished
+    assert serious(page) == []
+    page.set_viewport_size({"width": 320, "height": 700})
+    assert page.evaluate("document.documentElement.scrollWidth") == 320
 
 
 # --- speed --------------------------------------------------------------------------------------------------

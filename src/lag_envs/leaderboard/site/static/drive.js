@@ -701,8 +701,9 @@
       if (running) pause();
       tell("The gamepad is disconnected. Drive with the keys, or connect it again; Space continues.");
     });
-    const choices = Math.max(0, ...about.controls.map(({ values }) => values.length));
-    const listed = choices ? `, or 1 to ${Math.min(choices, 9)} for one of the listed actions` : "";
+    const lists = about.controls.map(({ values }) => values.length).filter(Boolean);
+    const meant = lists.length > 1 ? "that action of every list" : "one of the listed actions";
+    const listed = lists.length ? `, or 1 to ${Math.min(Math.max(...lists), 9)} for ${meant}` : "";
     /** The keys and what they control, to be read or to be heard. */
     const described = (keys, name, unitOf) => hands.pairs
       .map((pair, i) => {
