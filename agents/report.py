@@ -10,12 +10,11 @@ from typing import Any
 
 from agents.analysis import LEVELS, Data
 from agents.learners import learner_label
-from lag_envs.benchmark.console import short
 from lag_envs.benchmark.results import quartiles
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
-from lag_envs.tables import markdown_table
+from lag_envs.tables import markdown_table, rate_text
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured_entry
 
@@ -451,7 +450,7 @@ def rate_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     first = row["kind"], str(row["num_envs"])
     if row["problem"]:
         return *first, row["problem"]
-    return *first, *(short(quartiles(row[n])[1]) for n in ("adapter", "dummy")), f"{row['ratio'][1]:.1f}"
+    return *first, *(rate_text(quartiles(row[n])[1]) for n in ("adapter", "dummy")), f"{row['ratio'][1]:.1f}"
 
 
 def _pooled(found: Data) -> str:

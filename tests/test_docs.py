@@ -472,7 +472,7 @@ def test_speeds_on_a_gpu():
         (ROOT / name).read_text(encoding="utf-8") for name in ("docs/usage.md", "README.md", "CHANGELOG.md")
     )
     assert "take 20 billion steps a second in float32 and 10 billion in float64" in usage
-    assert f"{100 * single['share']:.0f} % of what the memory can copy" in usage
+    assert f"at {100 * single['share']:.0f} % of the rate at which the memory can copy" in usage
     assert "20 billion steps a second" in readme and "20 billion steps a second" in changes
     assert {id for id, *_ in rows} <= set(TASKS)
 

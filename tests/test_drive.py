@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import serious, until
-from covering import size, slow
+from covering import covering, size, slow
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 from own_tasks import Switched
@@ -113,7 +113,7 @@ def check_bits(page, folder, task, name, episodes, steps=math.inf):
         )
 
 
-@pytest.mark.parametrize("id", TASKS)
+@pytest.mark.parametrize("id", covering(TASKS))
 def test_the_pages_step_has_pythons_bits(browsing, alone, id):
     task = TASKS[id]()
     page = browsing.open(f"{alone.as_uri()}/{id}.html", alone.as_uri())
@@ -798,7 +798,7 @@ def test_one_record_with_everything(drive, monkeypatch, tmp_path):
     page = drive(Everything.id, folder=tmp_path, bypass_csp=True)
     task = Everything()
     check_bits(page, tmp_path, task, Everything.id, [(seed, at_random(task, seed)) for seed in (3, 2**63)])
-    assert "1 to 3 for that action of every list" in message(page)
+    assert "1 to 3 for the action with that number in each list" in message(page)
     page.select_option(".drive-controls select >> nth=1", "live:0")
     page.focus(".stage")
     page.keyboard.press("Space")

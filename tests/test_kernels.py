@@ -280,6 +280,7 @@ def test_the_benchmark_measures_both_precisions(monkeypatch):
     monkeypatch.setattr(benchmark_device, "DeviceEnvs", _on_any)
     monkeypatch.setattr(benchmark_device, "COPIED", 2**20)
     report = benchmark_device.measured([CHOICES.id, BAR.id], [3, 7], torch.device("cpu"), 1e-3, 3)
+    assert report["complete"]
     assert [(r["id"], r["precision"], r["num_envs"]) for r in report["rows"]] == [
         (id, precision, n)
         for id in (CHOICES.id, BAR.id)
@@ -287,24 +288,59 @@ def test_the_benchmark_measures_both_precisions(monkeypatch):
         for n in (3, 7)
     ]
     assert report["bandwidth"] > 0.0
-    assert all(min(r["steps"], r["replayed"], r["share"]) > 0.0 for r in report["rows"])
+    numbers = ("steps", "share", "replayed", "replayed_share")
+    assert all(r[name] > 0.0 for r in report["rows"] for name in numbers)
     # State, its cosine and sine, control there and back, action, reward; two observations, age, four flags.
     assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 7 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 4
 
 
+def test_what_fails_and_what_is_interrupted_leaves_the_rest(monkeypatch):
+    made = iter([on_processor, ValueError("no room"), on_processor, KeyboardInterrupt()])
+
+    def make(*given):
+        if isinstance(found := next(made), BaseException):
+            raise found
+        envs = found(given[0], given[1], dtype=given[3], autoreset_mode="SameStep")
+        envs.reset(seed=0)
+        return envs
+
+    monkeypatch.setattr(benchmark_device, "_under_way", make)
+    monkeypatch.setattr(benchmark_device, "COPIED", 2**20)
+    report = benchmark_device.measured([CHOICES.id], [3, 4], torch.device("cpu"), 1e-3, 3)
+    assert [r.get("problem") for r in report["rows"]] == [None, "failed: ValueError: no room", None]
+    assert not report["complete"]
+    lines = gpu.console_lines(report | {"date": "2020-02-20", "versions": {"torch": "2"}})
+    assert "no room" in lines[4] and lines[-1].startswith("interrupted")
+
+
 def test_its_results_can_be_read(tmp_path):
     rows = [
-        {"id": BAR.id, "precision": p, "num_envs": n, "steps": s * n, "replayed": 2 * s * n, "share": 0.25}
+        {
+            **{"id": BAR.id, "precision": p, "num_envs": n, "steps": s * n, "replayed": 2 * s * n},
+            **{"share": 0.25, "replayed_share": 0.5},
+        }
         for p, s in (("float32", 3e4), ("float64", 1e4))
         for n in (4, 2**20)
     ]
     report = {
         "date": "2020-02-20", "gpu": "G", "versions": {"torch": "2"}, "bandwidth": 3e12, "rows": rows,
-        "settings": {"rounds": 9, "seconds": 0.05},
+        "settings": {"sizes": [4, 2**20], "rounds": 9, "seconds": 0.05}, "complete": True,
     }  # fmt: skip
     lines = gpu.console_lines(report)
-    assert "G, whose memory copies 3.00 TB/s" in lines[0] and len(lines) == 3 + len(rows)
-    assert lines[4].split() == [BAR.id, "float32", "1,048,576", "31.5", "G", "62.9", "G", "25", "%"]
+    assert "G, bandwidth 3.00 TB/s" in lines[0] and len(lines) == 3 + len(rows)
+    assert lines[4].split() == [
+        BAR.id,
+        "float32",
+        "1,048,576",
+        "31.5",
+        "G",
+        "25",
+        "%",
+        "62.9",
+        "G",
+        "50",
+        "%",
+    ]
     (tmp_path / "docs").mkdir()
     page = tmp_path / "docs" / "speed.md"
     page.write_text("above <!-- gpu:begin --><!-- gpu:end --> below")
@@ -313,6 +349,8 @@ def test_its_results_can_be_read(tmp_path):
     text = page.read_text()
     assert "float32, 4 at once" in text and text.startswith("above") and text.endswith("below")
     assert f"| {BAR.id} | 120 k | 240 k | 31.5 G | 25 % | 10.5 G | 25 % |" in text
+    rows[0] = {"id": BAR.id, "precision": "float32", "num_envs": 4, "problem": "failed"}
+    assert f"| {BAR.id} |  |  | 31.5 G | 25 % |" in gpu.gpu_markdown(report)
 
 
 def _on_any(task, num_envs, device, dtype, **options):
@@ -334,7 +372,8 @@ def test_without_a_gpu(capsys):
         (["--device", "cuda"], "--device: there is no device 'cuda' here"),
         (["--device", "gpu"], "--device: device must be 'cpu' or 'cuda', got 'gpu'"),
         (["--device", "cuda", "--cold"], "--device does not go with --cold"),
-        (["--device", "cuda", "--quick", "--checkout", "."], "leave out IDs, --quick"),
+        (["--device", "cuda", "--quick", "--checkout", "."], "leave out IDs, --quick, --sizes"),
+        (["--device", "cuda", "--sizes", "1", "--checkout", "."], "leave out IDs, --quick, --sizes"),
     ):
         assert cli.main(["bench", *given]) == 2
         assert message in capsys.readouterr().err
@@ -395,12 +434,16 @@ def test_a_gpus_steps_may_be_recorded_in_a_graph_and_run_in_any_stream_and_threa
     with torch.cuda.graph(graph):
         recorded = envs.step(actions)
     side = torch.cuda.Stream()
+
+    def step_aside():  # a thread has its own current stream
+        with torch.cuda.stream(side):
+            return other.step(actions)
+
     with ThreadPoolExecutor(1) as pool:
         for _ in range(30):
             graph.replay()
-            with torch.cuda.stream(side):
-                found = pool.submit(other.step, actions).result()
-            side.synchronize()
             torch.cuda.synchronize()
+            found = pool.submit(step_aside).result()
+            side.synchronize()
             assert all(torch.equal(a, b) for a, b in zip(found[:4], recorded[:4], strict=True))
     assert torch.equal(envs.state, other.state)

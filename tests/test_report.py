@@ -232,12 +232,12 @@ def test_jobs_can_be_sent(name, quick):
 
 def test_compact_form(written, tmp_path, monkeypatch):
     (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "speed.json").write_text(
-        (PROJECT / "docs" / "speed.json").read_text(encoding="utf-8")
-    )
-    marks = {name: f"a <!-- {name}:begin --> <!-- {name}:end --> c" for name in ("bench", "fast")}
+    for name in ("speed.json", "speed-other.json", "gpu.json"):
+        (tmp_path / "docs" / name).write_text((PROJECT / "docs" / name).read_text(encoding="utf-8"))
+    names = ("bench", "fast", "other", "gpu")
+    marks = {name: f"a <!-- {name}:begin --> <!-- {name}:end --> c" for name in names}
     (tmp_path / "README.md").write_text(marks["fast"])
-    (tmp_path / "docs" / "speed.md").write_text(marks["fast"] + marks["bench"])
+    (tmp_path / "docs" / "speed.md").write_text("".join(marks.values()))
     monkeypatch.setattr(
         docs, "PARTS", (docs.PagePart(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
     )

@@ -171,21 +171,22 @@ class DeviceEnvs:
         mode = self.sample.autoreset_mode
         if mode == AutoresetMode.DISABLED and bool((self.ages < 0).any()):
             raise ResetNeeded("episodes are over: reset their environments with options['reset_mask']")
-        same_step = mode == AutoresetMode.SAME_STEP
-        # A GPU's step is so short that each allocation counts.
-        observations = self._new(1 + same_step, len(self.task.observation), dtype=torch.float32)
+        count = len(self.task.observation)
+        observations = self._new(count, dtype=torch.float32)
         rewards = self._new(dtype=self.dtype)
-        flags = self._new(3 + same_step, dtype=torch.bool)
+        terminated, truncated, refused = (self._new(dtype=torch.bool) for _ in range(3))
+        last = over = None
+        if mode == AutoresetMode.SAME_STEP:
+            last, over = self._new(count, dtype=torch.float32), self._new(dtype=torch.bool)
         self._launch(
             "step", self.num_envs, self.rows, self._ids, self.ages, self._constants, self._limit,
-            int(same_step), actions.detach().to(self.dtype).contiguous(), observations, rewards, flags,
+            actions.detach().to(self.dtype).contiguous(), observations, rewards, terminated, truncated,
+            refused, last, over,
         )  # fmt: skip
-        seen, *last = observations.mT.unbind()
-        terminated, truncated, refused, *over = flags.unbind()
         infos: dict[str, Any] = {"refused": refused}
-        if same_step:
-            infos |= {"final_obs": last[0], "_final_obs": over[0]}
-        return seen, rewards, terminated, truncated, infos
+        if last is not None:
+            infos |= {"final_obs": last.T, "_final_obs": over}
+        return observations.T, rewards, terminated, truncated, infos
 
     def _mask(self, mask: Any) -> Tensor:
         if mask is None:

@@ -1,9 +1,10 @@
 """How fast a GPU steps environments: the command ``lag-envs bench --device cuda``.
 
 The rate is that of whole steps as in training: control, motion, reward, observation, ending, kick and
-restarts, in environments that are in the midst of their episodes. It is measured twice: calling `step`, and
-replaying a CUDA graph of it, which leaves out Python's share. Beside the latter stands the data that a step
-has to read and write, as a share of the memory's rate, which is measured by copying in the same run.
+restarts, with random actions, at all times of the episodes. It is measured in two ways, in turn: calling
+`step`, and replaying a CUDA graph of it, which leaves out Python's share. Beside both stands the data that
+such a step has to read and write, as a share of the memory bandwidth, which is measured by copying in the
+same run.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from itertools import product
 from statistics import median
 from typing import Any
 
-import numpy as np
 import torch
 
 from lag_envs.device import DeviceEnvs
@@ -26,8 +26,10 @@ COPIED = 2**28
 FLAGS = 4 + 4 + 4
 #: Environments that go through an episode before a measurement, to provide states, and its maximum length.
 FEW, LONGEST = 4096, 1000
-#: Batches of random actions, used in turn.
-BATCHES = 4
+#: Batches of random actions, used in turn while time is measured.
+BATCHES = 16
+
+Run = Callable[[], Any]
 
 
 def measured(
@@ -35,10 +37,12 @@ def measured(
 ) -> dict[str, Any]:
     """Measure environments on a GPU, in single and in double precision.
 
+    What fails has its error in its row. An interrupt ends the measurement.
+
     Parameters
     ----------
     ids : sequence of str
-        Environments without imperfections.
+        Environments.
     sizes : sequence of int
         Numbers of environments.
     device : torch.device
@@ -51,37 +55,43 @@ def measured(
     Returns
     -------
     dict
-        ``gpu``, its name; ``settings``; ``bandwidth``, the bytes a second that copying reads and writes; and
-        ``rows``. A row has ``id``, ``precision`` and ``num_envs``; ``steps`` and ``replayed``, the steps a
-        second of all environments together, when `step` is called and in a CUDA graph; and ``share``, the
-        data of the latter as a share of the bandwidth.
+        ``gpu``, its name; ``settings``; ``bandwidth``, the bytes a second that copying reads and writes;
+        ``complete``, whether it was not interrupted; and ``rows``. A row has ``id``, ``precision`` and
+        ``num_envs``, and then ``problem``, or ``steps`` and ``replayed``, the steps a second of all
+        environments together when `step` is called and in a CUDA graph, and ``share`` and
+        ``replayed_share``, their data as a share of the bandwidth.
     """
-
-    def calls_a_second(run: Callable[[], Any]) -> float:
-        return _calls_a_second(run, device, seconds, rounds)
-
-    bandwidth = 2 * 4 * COPIED * calls_a_second(_copying(device))
-    rows = []
+    (copies,) = _rates([_copying(device)], device, seconds, rounds)
+    report: dict[str, Any] = {
+        "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else "none",
+        "settings": {"sizes": list(sizes), "seconds": seconds, "rounds": rounds},
+        "bandwidth": 2 * 4 * COPIED * copies,
+        "complete": False,
+        "rows": [],
+    }
     cases = list(product(ids, (torch.float32, torch.float64), sizes))
     with progress(len(cases)) as advance:
         for env_id, dtype, size in cases:
-            envs = _under_way(env_id, size, device, dtype)
-            run = _stepping(envs)
-            replayed = BATCHES * size * calls_a_second(_in_graph(run, device))
-            rows.append(
-                {
-                    "id": env_id,
-                    "precision": str(dtype).removeprefix("torch."),
-                    "num_envs": size,
-                    "steps": BATCHES * size * calls_a_second(run),
-                    "replayed": replayed,
-                    "share": replayed * traffic(envs) / bandwidth,
-                }
-            )
+            row: dict[str, Any] = {
+                "id": env_id,
+                "precision": str(dtype).removeprefix("torch."),
+                "num_envs": size,
+            }
+            try:
+                envs = _under_way(env_id, size, device, dtype)
+                run = _stepping(envs)
+                rates = _rates([run, _in_graph(run, device)], device, seconds, rounds)
+            except KeyboardInterrupt:
+                return report
+            except Exception as error:
+                row["problem"] = " ".join(f"failed: {type(error).__name__}: {error}".split())[:200]
+            else:
+                row["steps"], row["replayed"] = (BATCHES * size * rate for rate in rates)
+                per_step = traffic(envs) / report["bandwidth"]
+                row["share"], row["replayed_share"] = row["steps"] * per_step, row["replayed"] * per_step
+            report["rows"].append(row)
             advance(env_id)
-    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else "none"
-    settings = {"sizes": list(sizes), "seconds": seconds, "rounds": rounds}
-    return {"gpu": gpu, "settings": settings, "bandwidth": bandwidth, "rows": rows}
+    return report | {"complete": True}
 
 
 def traffic(envs: DeviceEnvs) -> int:
@@ -92,14 +102,19 @@ def traffic(envs: DeviceEnvs) -> int:
     return number * (2 * kept + actions + 1) + 2 * 4 * seen + FLAGS
 
 
-def _copying(device: torch.device) -> Callable[[], Any]:
+def _copying(device: torch.device) -> Run:
     """Return a function that copies numbers from one place of the memory to another."""
     numbers, copy = torch.empty(2, COPIED, dtype=torch.float32, device=device)
     return lambda: copy.copy_(numbers)
 
 
 def _under_way(env_id: str, size: int, device: torch.device, dtype: torch.dtype) -> DeviceEnvs:
-    """Return environments at all times of their episodes, with the states that random actions lead to."""
+    """Return environments whose episodes are under way, with the states that random actions lead to.
+
+    Some go through a whole episode, or the first `LONGEST` steps of one, ending it at different times. The
+    others are copies of these.
+    """
+    torch.manual_seed(0)
     few, envs = (
         DeviceEnvs(env_id, n, device, dtype, autoreset_mode="SameStep") for n in (min(size, FEW), size)
     )
@@ -107,23 +122,28 @@ def _under_way(env_id: str, size: int, device: torch.device, dtype: torch.dtype)
     envs.reset(seed=0)
     length = int(min(few.task.limit, LONGEST))
     few.ages.random_(length)
-    run = _stepping(few)
-    for _ in range(0, length, BATCHES):
-        run()
+    for _ in range(length):
+        few.step(_random_actions(few))
     for given, found in ((envs.rows, few.rows), (envs.ages, few.ages)):
         copies = found.repeat(*[1] * (found.ndim - 1), -(-size // few.num_envs))
         given.copy_(copies[..., :size])
     return envs
 
 
-def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
+def _random_actions(envs: DeviceEnvs) -> torch.Tensor:
+    """Return an action for each environment."""
+    space: Any = envs.sample.single_action_space
+    shape = envs.num_envs, *(space.shape or ())
+    if not envs.task.formulas.choices:
+        low, high = (torch.as_tensor(x, device=envs.device) for x in (space.low, space.high))
+        return low + (high - low) * torch.rand(shape, dtype=envs.dtype, device=envs.device)
+    choices = torch.tensor(envs.task.formulas.choices, device=envs.device).expand(shape)
+    return (torch.rand(shape, device=envs.device) * choices).long()
+
+
+def _stepping(envs: DeviceEnvs) -> Run:
     """Return a function that takes steps with random actions made beforehand."""
-    space = envs.sample.single_action_space
-    space.seed(0)
-    sample = torch.as_tensor(np.array([space.sample() for _ in range(1000)]), device=envs.device)
-    if sample.is_floating_point():
-        sample = sample.to(envs.dtype)
-    actions = sample[torch.randint(len(sample), (BATCHES, envs.num_envs), device=envs.device)].unbind()
+    actions = [_random_actions(envs) for _ in range(BATCHES)]
 
     def run() -> None:
         for batch in actions:
@@ -132,24 +152,24 @@ def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
     return run
 
 
-def _in_graph(run: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
+def _in_graph(run: Run, device: torch.device) -> Run:
     """Return a function that replays steps recorded in a CUDA graph; without a GPU, the steps."""
     if device.type != "cuda":
         return run
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    with torch.cuda.device(device), torch.cuda.graph(graph):
         run()
     return graph.replay
 
 
-def _calls_a_second(run: Callable[[], Any], device: torch.device, seconds: float, rounds: int) -> float:
-    """Return how often per second a function can be called, the median of samples of a given length."""
+def _rates(runs: Sequence[Run], device: torch.device, seconds: float, rounds: int) -> list[float]:
+    """Return how often per second functions can be called: medians of samples of a given length, in turn."""
 
     def wait() -> None:
         if device.type == "cuda":
             torch.cuda.synchronize(device)
 
-    def sample(count: int) -> float:
+    def sample(run: Run, count: int) -> float:
         wait()
         begun = time.perf_counter()
         for _ in range(count):
@@ -157,6 +177,8 @@ def _calls_a_second(run: Callable[[], Any], device: torch.device, seconds: float
         wait()
         return (time.perf_counter() - begun) / count
 
-    sample(1)
-    count = max(1, round(seconds / sample(1)))
-    return 1.0 / median(sample(count) for _ in range(rounds))
+    for run in runs:
+        sample(run, 1)
+    counts = [max(1, round(seconds / sample(run, 1))) for run in runs]
+    times = [[sample(run, count) for run, count in zip(runs, counts, strict=True)] for _ in range(rounds)]
+    return [1.0 / median(column) for column in zip(*times, strict=True)]

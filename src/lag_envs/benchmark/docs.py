@@ -27,6 +27,27 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
         write_figure(costs, checkout / "docs" / CHAINS)
 
 
+def other_processor(report: dict[str, Any]) -> str:
+    """Return docs/speed.md's sentences on a processor beside that of the table: its largest batches."""
+    target = TARGETS[-1]
+    ratios = reached_targets(report["rows"], target)
+    shares = {row["id"]: 100 * row["share"][1] for row in report["arithmetic"]}
+    below = sorted(shares[id] for id, ratio in ratios.items() if ratio < target.ratio)
+    peak = next(row["steps_per_second"][1] for row in report["rows"] if row["library"] == CORE)
+    found = (
+        f"On another {report['machine']['processor']}, with a peak of {rate_text(peak)} multiply-adds a "
+        f"second, {len(ratios)} environments with a flow of their own, {target.num_envs:,} at once, reach "
+        f"{min(ratios.values()):.2g} to {max(ratios.values()):.2g} times CartPole's speed "
+        f"(`docs/speed-other.json`, {report['date']})."
+    )
+    if not below:
+        return found
+    return found + (
+        f" {len(below)} of them are below the target of {target.ratio:g}, at {below[0]:.0f} to "
+        f"{below[-1]:.0f} % of the peak."
+    )
+
+
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
     """Return the files of a checkout with a report's texts, as they should be."""
     page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
@@ -70,7 +91,7 @@ def speed_markdown(report: dict[str, Any]) -> str:
     ]
     machine, settings = report["machine"], report["settings"]
     peaks = [row["steps_per_second"][1] for row in report["rows"] if row["library"] == CORE and row["rates"]]
-    peak = f", which adds {rate_text(peaks[0])} products a second" if peaks else ""
+    peak = f", with a peak of {rate_text(peaks[0])} multiply-adds a second" if peaks else ""
     parts = [
         "Time of a step, also as a multiple of the time of Gymnasium's `CartPole-v1` for as many "
         f"environments: medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "

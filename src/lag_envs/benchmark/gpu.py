@@ -17,51 +17,60 @@ def console_lines(report: dict[str, Any]) -> list[str]:
         "precision",
         "environments",
         "steps/s",
+        "of bandwidth",
         "in a CUDA graph",
-        "share of the memory's rate",
+        "of bandwidth",
     )
     rows = [
         (
             row["id"],
             row["precision"],
             f"{row['num_envs']:,}",
-            rate_text(row["steps"]),
-            rate_text(row["replayed"]),
-            share(row),
+            *([row["problem"]] if "problem" in row else _cells(row)),
         )
         for row in report["rows"]
     ]
-    return [_about(report), "", *aligned([head, *rows])]
+    lines = [_about(report), "", *aligned([head, *rows])]
+    return lines if report["complete"] else [*lines, "", "interrupted: these are the results so far"]
 
 
 def gpu_markdown(report: dict[str, Any]) -> str:
     """Return the table of docs/speed.md: the smallest and the largest number of environments."""
     rows = {(row["id"], row["precision"], row["num_envs"]): row for row in report["rows"]}
-    few, many = (f(row["num_envs"] for row in report["rows"]) for f in (min, max))
-    ids = dict.fromkeys(row["id"] for row in report["rows"])
+    few, many = (f(report["settings"]["sizes"]) for f in (min, max))
 
     def cells(id: str) -> list[str]:
-        alone, *both = (rows[id, p, n] for p, n in (("float32", few), ("float32", many), ("float64", many)))
-        large = [cell for row in both for cell in (rate_text(row["steps"]), share(row))]
-        return [id, rate_text(alone["steps"]), rate_text(alone["replayed"]), *large]
+        small, *large = (rows[id, p, n] for p, n in (("float32", few), ("float32", many), ("float64", many)))
+        found = ["", ""] if "problem" in small else [rate_text(small[name]) for name in ("steps", "replayed")]
+        return [
+            id,
+            *found,
+            *(
+                cell
+                for row in large
+                for cell in ([row["problem"], ""] if "problem" in row else _cells(row)[:2])
+            ),
+        ]
 
     head = (
         "id",
         f"float32, {few:,} at once",
-        "replayed",
+        "in a CUDA graph",
         f"float32, {many:,} at once",
-        "of the memory's rate",
+        "of bandwidth",
         f"float64, {many:,} at once",
-        "of the memory's rate",
+        "of bandwidth",
     )
+    ids = dict.fromkeys(row["id"] for row in report["rows"])
     return f"Steps per second. {_about(report)}.\n\n{markdown_table(head, map(cells, ids))}"
 
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
     """Write a report into a checkout: ``docs/gpu.json``, and the table of docs/speed.md."""
     page = checkout / "docs" / "speed.md"
+    text = with_table(page.read_text(encoding="utf-8"), report)
     write_file(checkout / "docs" / "gpu.json", readable_json(report))
-    write_file(page, with_table(page.read_text(encoding="utf-8"), report))
+    write_file(page, text)
 
 
 def with_table(page: str, report: dict[str, Any]) -> str:
@@ -69,16 +78,20 @@ def with_table(page: str, report: dict[str, Any]) -> str:
     return replaced(page, "gpu", gpu_markdown(report))
 
 
-def share(row: dict[str, Any]) -> str:
-    """Return a share of the memory's rate as text."""
-    return f"{100 * row['share']:.0f} %"
+def _cells(row: dict[str, Any]) -> list[str]:
+    """Return rates and shares of the bandwidth: of steps that are called, and in a CUDA graph."""
+    return [
+        cell
+        for rate, share in (("steps", "share"), ("replayed", "replayed_share"))
+        for cell in (rate_text(row[rate]), f"{100 * row[share]:.0f} %")
+    ]
 
 
 def _about(report: dict[str, Any]) -> str:
     """Return one line on the machine and the measurement."""
     settings = report["settings"]
     return (
-        f"{report['gpu']}, whose memory copies {report['bandwidth'] / 1e12:.2f} TB/s (read and written); "
+        f"{report['gpu']}, bandwidth {report['bandwidth'] / 1e12:.2f} TB/s (read and written); "
         f"PyTorch {report['versions']['torch']}; medians of {settings['rounds']} samples of "
         f"{settings['seconds']:g} s (`lag-envs bench --device cuda`, {report['date']})"
     )

@@ -41,12 +41,13 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--output",
         type=new_file,
         metavar="FILE",
-        help="write everything, raw samples included, to this JSON file",
+        help="write everything, raw samples included, to this JSON file; with --device the medians",
     )
     parser.add_argument(
         "--checkout",
         metavar="FOLDER",
-        help="write everything into docs/speed.json, docs/speed.md and README.md of this checkout",
+        help="write everything into docs/speed.json, docs/speed.md and README.md of this checkout; with "
+        "--device into docs/gpu.json and docs/speed.md",
     )
     parser.add_argument(
         "--with",
@@ -139,8 +140,10 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     if args.threads > 1 or args.clock == "cpu" or args.cold or args.keywords:
         raise UserError("--device does not go with --cold, --with, --threads, --clock cpu: leave them out")
     if args.checkout is not None:
-        if args.ids or args.quick:
-            raise UserError("--checkout writes a whole measurement into a checkout: leave out IDs, --quick")
+        if args.ids or args.quick or args.sizes:
+            raise UserError(
+                "--checkout writes a whole measurement into a checkout: leave out IDs, --quick, --sizes"
+            )
         check_checkout("--checkout", args.checkout)
     needs("torch", "torch")
     from lag_envs.benchmark import gpu
@@ -152,6 +155,11 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     except ValueError as error:
         raise UserError(f"--device: {error}") from error
     perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
+    if args.ids and (others := [env_id for env_id in ids if env_id not in perfect]):
+        raise UserError(
+            f"--device: {', '.join(others)} cannot be on a GPU: imperfect sensors or actuators, or hidden "
+            "parameters"
+        )
     about = {
         "date": args.date,
         "machine": machine(),
@@ -164,10 +172,10 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     if args.output:
         write_file(args.output, readable_json(report))
         print(f"written to {args.output}")
-    if args.checkout is not None:
+    if args.checkout is not None and report["complete"]:
         gpu.take_over(report, Path(args.checkout))
         print(f"written to docs/gpu.json and docs/speed.md in {args.checkout}")
-    return 0
+    return 0 if report["complete"] else 130
 
 
 def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -97,10 +97,10 @@ KERNEL begin(long long n, real *rows, word *ids, int *ages, const real *k, const
   }
 }
 
-// With `same_step`, `observations` has a second block for episodes' last ones, `flags` a row that marks them.
+// `last` and `restarted` are null unless the next episode begins in the step that ends one.
 KERNEL step(long long n, real *rows, word *ids, int *ages, const real *k, long long limit,
-            long long same_step, const real *actions, float *observations, real *rewards, bool *flags) {
-  float *last = same_step ? observations + OBSERVED * n : 0;
+            const real *actions, float *observations, real *rewards, bool *terminated, bool *truncated,
+            bool *refused, float *last, bool *restarted) {
   const int choices[ACTIONS + 1] = {CHOICES};
   EACH(i, n) {
     real f[SIZE];
@@ -154,10 +154,10 @@ KERNEL step(long long n, real *rows, word *ids, int *ages, const real *k, long l
     save(f, rows, i, n);
     show(f, observations, i, n);
     rewards[i] = reward;
-    flags[i] = ended;
-    flags[n + i] = late;
-    flags[2 * n + i] = wrong;
-    if (last) flags[3 * n + i] = ended || late;
+    terminated[i] = ended;
+    truncated[i] = late;
+    refused[i] = wrong;
+    if (last) restarted[i] = ended || late;
   }
 }
 """

@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lag_envs.benchmark import gpu
+from lag_envs.benchmark.docs import other_processor
 from lag_envs.benchmark.docs import texts as speed_texts
+from lag_envs.generated import replaced
 from lag_envs.options import module_parser
 from lag_envs.report import overview, page
 from lag_envs.report.content import ReportFigure
@@ -156,13 +158,14 @@ def update(project: Path) -> None:
 def generated(project: Path) -> dict[Path, str]:
     """Return the generated files as they should be."""
     docs = project / "docs"
-    accuracy, speed, on_gpu = (
+    accuracy, speed, other, on_gpu = (
         json.loads((docs / name).read_text(encoding="utf-8"))
-        for name in ("accuracy.json", "speed.json", "gpu.json")
+        for name in ("accuracy.json", "speed.json", "speed-other.json", "gpu.json")
     )
     found = {docs / "accuracy.md": accuracy_markdown(accuracy), docs / DETAILS: details(accuracy)}
     found |= speed_texts(speed, project)
-    found[docs / "speed.md"] = gpu.with_table(found[docs / "speed.md"], on_gpu)
+    page = replaced(found[docs / "speed.md"], "other", other_processor(other))
+    found[docs / "speed.md"] = gpu.with_table(page, on_gpu)
     return found
 
 

@@ -702,7 +702,7 @@
       tell("The gamepad is disconnected. Drive with the keys, or connect it again; Space continues.");
     });
     const lists = about.controls.map(({ values }) => values.length).filter(Boolean);
-    const meant = lists.length > 1 ? "that action of every list" : "one of the listed actions";
+    const meant = lists.length > 1 ? "the action with that number in each list" : "one of the listed actions";
     const listed = lists.length ? `, or 1 to ${Math.min(Math.max(...lists), 9)} for ${meant}` : "";
     /** The keys and what they control, to be read or to be heard. */
     const described = (keys, name, unitOf) => hands.pairs
