@@ -350,7 +350,7 @@ def test_its_results_can_be_read(tmp_path):
     assert "float32, 4 at once" in text and text.startswith("above") and text.endswith("below")
     assert f"| {BAR.id} | 120 k | 240 k | 31.5 G | 25 % | 10.5 G | 25 % |" in text
     rows[0] = {"id": BAR.id, "precision": "float32", "num_envs": 4, "problem": "failed"}
-    assert f"| {BAR.id} |  |  | 31.5 G | 25 % |" in gpu.gpu_markdown(report)
+    assert f"| {BAR.id} | failed |  | 31.5 G | 25 % |" in gpu.gpu_markdown(report)
 
 
 def _on_any(task, num_envs, device, dtype, **options):

@@ -21,15 +21,7 @@ def console_lines(report: dict[str, Any]) -> list[str]:
         "in a CUDA graph",
         "of bandwidth",
     )
-    rows = [
-        (
-            row["id"],
-            row["precision"],
-            f"{row['num_envs']:,}",
-            *([row["problem"]] if "problem" in row else _cells(row)),
-        )
-        for row in report["rows"]
-    ]
+    rows = [(row["id"], row["precision"], f"{row['num_envs']:,}", *_cells(row)) for row in report["rows"]]
     lines = [_about(report), "", *aligned([head, *rows])]
     return lines if report["complete"] else [*lines, "", "interrupted: these are the results so far"]
 
@@ -40,17 +32,9 @@ def gpu_markdown(report: dict[str, Any]) -> str:
     few, many = (f(report["settings"]["sizes"]) for f in (min, max))
 
     def cells(id: str) -> list[str]:
-        small, *large = (rows[id, p, n] for p, n in (("float32", few), ("float32", many), ("float64", many)))
-        found = ["", ""] if "problem" in small else [rate_text(small[name]) for name in ("steps", "replayed")]
-        return [
-            id,
-            *found,
-            *(
-                cell
-                for row in large
-                for cell in ([row["problem"], ""] if "problem" in row else _cells(row)[:2])
-            ),
-        ]
+        cases = ("float32", few), ("float32", many), ("float64", many)
+        small, single, double = (_cells(rows[id, *case]) for case in cases)
+        return [id, *small[::2], *single[:2], *double[:2]]
 
     head = (
         "id",
@@ -80,6 +64,8 @@ def with_table(page: str, report: dict[str, Any]) -> str:
 
 def _cells(row: dict[str, Any]) -> list[str]:
     """Return rates and shares of the bandwidth: of steps that are called, and in a CUDA graph."""
+    if "problem" in row:
+        return [row["problem"], "", "", ""]
     return [
         cell
         for rate, share in (("steps", "share"), ("replayed", "replayed_share"))

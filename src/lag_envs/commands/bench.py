@@ -73,13 +73,16 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         help="measure on a GPU, cuda, instead of the processor (default sizes: 4096,1048576)",
     )
     parser.add_argument(
-        "--rounds", metavar="N", type=count, help="samples of each row (default: 31, or 9 with --quick)"
+        "--rounds",
+        metavar="N",
+        type=count,
+        help="samples of each row (default: 31, or 9 with --quick or --device)",
     )
     parser.add_argument(
         "--seconds",
         metavar="S",
         type=seconds,
-        help="length of a sample (default: 0.05, or 0.02 with --quick)",
+        help="length of a sample (default: 0.05, or 0.02 with --quick, without --device)",
     )
     parser.add_argument(
         "--clock",
