@@ -191,6 +191,7 @@ def test_trainings_are_different_though_all_else_is_the_same():
 # --- by hand ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_at_least_half_of_the_policies(tmp_path):
     first = learned(tmp_path / "first")
     likeness = Likeness(first.env, "n")

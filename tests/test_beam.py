@@ -152,6 +152,7 @@ def test_what_cannot_work_is_refused():
             beam(task, **numbers)
 
 
+@pytest.mark.slow
 def test_cart_pole_stands_for_the_whole_episode():
     assert play(CART_POLE, make_controller(CART_POLE, "beam search"), range(1)).tolist() == [500.0]
 

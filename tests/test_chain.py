@@ -221,6 +221,7 @@ def test_tasks_without_kicks():
     assert without_kicks(calm) is calm and calm.dt == task.dt and calm.scene == task.scene
 
 
+@pytest.mark.slow
 def test_mpc_for_any_task():
     """It balances a bar, planning in every step, without being told how."""
     task = pivoted_bar.Balance(duration=1.0)

@@ -61,6 +61,7 @@ def test_an_episode_that_begins_is_believed_anew():
     assert np.abs(single.state[0] - again.state[1]).max() <= 1e-15
 
 
+@pytest.mark.slow
 def test_plans_are_renewed_by_each_estimate_alone():
     """Also those of an episode that begins while another's plan is under way."""
     task, rng = TASKS[SwingUpTripleNoisy.id](), np.random.default_rng(0)

@@ -132,7 +132,7 @@ HEAVY = {
 #: Those that take seconds to compile or in exact arithmetic.
 LONG = (
     "support at rest", "support driven", "no field", "shell turns", "shell turns without gravity",
-    "the control is the drag",
+    "the control is the drag", "plane turns",
 )  # fmt: skip
 
 
@@ -151,6 +151,7 @@ def test_heavy_damping(case):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
+@pytest.mark.slow
 def test_what_equations_lack_has_no_column():
     scene = CartPole()
     a, b = scene.jacobian([0.3, -1.0, 2.0, 3.0], 4.0, 0.02)

@@ -26,6 +26,7 @@ def random_drive(rng, ramp=True):
     return w, mp.cos(angle), mp.sin(angle), Coefficients(a, b, gamma, d, r if ramp else 0.0)
 
 
+@pytest.mark.slow
 def test_coefficients_are_derivatives():
     """W_k k! is the k-th derivative of W, by repeated differentiation of polynomials in W, cos, sin, t."""
     import sympy

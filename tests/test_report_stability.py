@@ -212,6 +212,7 @@ def test_a_cell_without_a_reference_says_so(monkeypatch):
     draw(content)
 
 
+@pytest.mark.slow
 def test_refused_and_amplified_cells():
     """A fast start is refused; 850,000 substeps in a shell that leaves no room are accurate to rounding."""
     (fast,) = stability.map_errors("speed", "PivotedBar", 1.0, [1e7])

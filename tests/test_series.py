@@ -641,6 +641,7 @@ class Ledge(Scene):
         return self.height * xp.tanh(q.x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [9.0, -16.0, 25.0])
 def test_force_of_a_tanh_keeps_its_digits(x):
     """h - h tanh² would have none left."""
