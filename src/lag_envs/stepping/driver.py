@@ -416,7 +416,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., allowed)``, see `_pull_all` and `compile_pull`."""
-    width = lanes(record)
+    width = max(4, registers().doubles)  # even small series take many numbers on the way back
     numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     helpers = compile_pull(record, sources, width), _compile_lengths()[0], *loops
