@@ -33,6 +33,9 @@ SMALLEST_PART = 1e-9
 COMPLETE = 1e-13
 #: Last terms of derivatives below this part of them may be rounding errors.
 ROUNDED = 2e-15
+#: Steep functions, and the part of the usual tolerance with which their records are stepped for reverse mode:
+#: derivatives leave out far more than the motion.
+STEEP, STRICTER = {"atan", "tanh"}, 1e-3
 #: A part of the control step that derivatives alone do not divide further.
 SHORT = 1e-6
 
@@ -272,12 +275,11 @@ def _compile_lengths() -> tuple[Callable, Callable]:
     return enough_of, next_length
 
 
-def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order, allowed):  # type: ignore[no-untyped-def]
+def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
     """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
 
-    No substep leaves out more than `allowed`, see `TOLERANCE`, or is longer than its lane's entry of
-    `longest`. Where that was too long for the derivatives, a smaller one takes its place, and what was found
-    for the lane is of no use.
+    No substep is longer than its lane's entry of `longest`. Where that was too long for the derivatives, a
+    smaller one takes its place, and what was found for the lane is of no use.
 
     Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
@@ -332,7 +334,7 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
             put(before[2 * n], table[left], BLOCK)
             still = 0
             for begin in range(0, going, LANES):
-                back = pull(rows, begin, dt, order, allowed) > 0
+                back = pull(rows, begin, dt, order, tolerance) > 0
                 until = min(begin + LANES, going)
                 if back:
                     for r in range(wanted):
@@ -415,9 +417,11 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
-    """Compile ``pull_all(given, cotangents, found, ..., allowed)``, see `_pull_all` and `compile_pull`."""
+    """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = max(4, registers().doubles)  # even small series take many numbers on the way back
-    numbers = _numbers(record, TOLERANCE) | {"BLOCK": BLOCK, "LANES": width}
+    steep = any(node.op in STEEP for node in record.nodes)
+    tolerance = TOLERANCE * (STRICTER if steep else 1.0)
+    numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     helpers = compile_pull(record, sources, width), _compile_lengths()[0], *loops
     return compile_python("pull_all", _pull_all, *helpers, **numbers)

@@ -30,9 +30,6 @@ from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE
 
 #: How many terms more the series of derivatives has.
 FURTHER = 1
-#: What a substep may leave out of the motion, as a part of `TOLERANCE`, where derivatives of a record with
-#: steep functions are taken: they leave out far more.
-STRICTER, STEEP = 1e-3, {"atan", "tanh"}
 
 
 class SeriesStepper:
@@ -355,13 +352,11 @@ class SeriesTangent:
         given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
         found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
         some = np.arange(len(states))
-        steep = any(node.op in STEEP for node in self._record.nodes)
-        tolerance = TOLERANCE * (STRICTER if steep else 1.0)
         while len(some):  # again those whose substeps were too long for the derivatives
             every = len(some) == len(states)
             shorter, pulled = longest[some], found if every else np.empty((self._width, len(some)))
             parts = (given, seeds) if every else (given[:, some].copy(), seeds[:, some].copy())
-            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further, tolerance):
+            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further):
                 # Substeps backwards are no longer than the shortest of the step. Forwards they grow again.
                 i = some[refused - 1 : refused]
                 slopes, refused = self.jacobian(states[i], controls[i], dt, order)
