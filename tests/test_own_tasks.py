@@ -532,32 +532,60 @@ def test_a_state_is_not_taken_for_velocities():
             _mistaken(reward=reward)()
 
 
-def test_velocities_of_a_task_are_in_the_order_of_energies():
-    class Belt(Scene):
-        coordinates = {"x": "m"}
-        prescribed = {"s": "m"}
-        controls = {"s_ddot": "m/s²"}
+class Hoist(Scene):
+    """A bead and a weight; formulas take places and velocities by index, and one coordinate rests."""
 
-        def kinetic(self, q, v, xp):
-            x_dot, s_dot = v
-            return x_dot**2 + 3.0 * s_dot**2
+    ceiling: float = parameter(2.0, "m")
 
-        def potential(self, q, xp):
-            return q.x**2
+    coordinates = {"x": "m", "y": "m"}
+    prescribed = {"lift": "m", "s": "m"}
+    controls = {"s_ddot": "m/s²"}
 
-    class Ride(Task):
-        scene = Belt
+    def rests(self):
+        return {"lift": 3.0 * self.ceiling}
+
+    def kinetic(self, q, v, xp):
+        x_dot, y_dot, lift_dot, s_dot = v
+        return x_dot**2 + 2.0 * y_dot**2 + 3.0 * s_dot**2 + 5.0 * lift_dot**2
+
+    def potential(self, q, xp):
+        return q[0] ** 2 + 10.0 * q[1] ** 2 + 100.0 * q[2] + 0.5 * q[0] * q[3]
+
+    def poses(self, q, xp):
+        x, y, lift, s = q
+        return {"bead": (x + s, y + lift, 0.0)}
+
+
+@pytest.mark.parametrize("places", ["after", "after.q"])
+def test_places_and_velocities_of_a_task_are_in_the_order_of_energies(places):
+    class Hang(Task):
+        scene = Hoist
         action = {"s_ddot": 1.0}
 
         def observe(self, after, target, xp):
-            return {"energy": self.scene.kinetic(after, after.v, xp)}
+            at = after if places == "after" else after.q
+            x, y, _ = self.scene.poses(at, xp)["bead"]
+            potential = self.scene.potential(at, xp=xp)
+            return {"T": self.scene.kinetic(at, after.v, xp), "V": potential, "x": x, "y": y}
 
         def reward(self, before, after, control, target, dt, xp):
-            return after.x
+            return self.scene.potential(after, xp) - after.q.lift - after.v.lift
 
-    task, state = Ride(), [0.1, 2.0, 0.3, 5.0]
-    seen = task.formulas.observe(np, state, [], SimpleNamespace(**task.formulas.constants()))
-    assert seen == [task.scene.energy(state)["kinetic"]] == [5.0**2 + 3.0 * 2.0**2]
+    state = [0.1, 2.0, 0.3, 5.0, 0.2, 0.7]
+    for ceiling in (2.0, 4.0):
+        task = Hang(ceiling=ceiling)
+        energy = task.scene.energy(state)
+        k = SimpleNamespace(**task.formulas.constants())
+        seen = task.formulas.observe(np, state, [], k)
+        assert task.scene.state_names == ("s", "s_dot", "x", "x_dot", "y", "y_dot")
+        assert seen == pytest.approx(
+            [energy["kinetic"], energy["potential"], 0.3 + 0.1, 0.2 + 3.0 * ceiling], rel=1e-15
+        )
+        env = LagrangianEnv(Hang, ceiling=ceiling)
+        env.reset(seed=0, options={"state": state})
+        _, reward, *_ = env.step([0.3])
+        expected = env.scene.energy(env.state)["potential"] - 3.0 * ceiling
+        assert reward == pytest.approx(expected, rel=1e-15)
 
 
 def test_a_task_without_a_scene():

@@ -49,8 +49,9 @@ class Task:
     targets. Formulas may use ``+ - * /``, integer powers, comparisons joined by ``|`` and ``&``, functions
     of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum), and the scene's
     parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)`` and
-    ``self.scene.kinetic(after, after.v, xp)``, where ``after.v`` has the velocities by coordinate, unless
-    these jump with a control and the state holds ``w`` instead.
+    ``self.scene.kinetic(after, after.v, xp)``. ``after.q`` and ``after.v`` are the places and velocities by
+    coordinate, as the energies take them; there is no ``after.v`` of a coordinate whose velocity jumps with a
+    control: the state holds ``w`` instead.
 
     Attributes
     ----------

@@ -69,9 +69,19 @@ class RecordedStep(NamedTuple):
 
 
 class State(Values):
-    """The entries of a state by name, which are no velocities."""
+    """The entries of a state; as ``q`` and ``v`` the places and velocities of its coordinates.
 
-    __slots__ = ()
+    A coordinate of that name hides these.
+    """
+
+    __slots__ = ("places",)
+
+    def __init__(self, entries: Mapping[str, Any], places: Values, velocities: Values) -> None:
+        hidden = {"q": places, "v": velocities}
+        super().__init__(
+            "entry of the state", entries, {name: hidden[name] for name in hidden if name not in entries}
+        )
+        object.__setattr__(self, "places", places)
 
 
 class Lifted:
@@ -234,15 +244,18 @@ class TaskFormulas:
         task = copy.copy(self._task)
         for name in ("formulas", "drawn"):
             vars(task).pop(name, None)
-        names = parameter_names(self._task.scene)
-        task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
-        for name in ("kinetic", "dissipation", "applied"):
-            vars(task.scene)[name] = _taking_velocities(task.scene, name)
+        task.scene = self._scene_with_numbers(k)
+        for name in ARGUMENTS:
+            vars(task.scene)[name] = _taking_states(task.scene, name)
         task.dt = k.dt
         task._recording = RecordedStep(
             k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
         )
         return task
+
+    def _scene_with_numbers(self, k: Any) -> Any:
+        scene = self._task.scene
+        return twin(scene, {name: getattr(k, f"self_{name}") for name in parameter_names(scene)})
 
     def _known(self, xp: Any, *states: Sequence) -> Any:
         """Return the namespace that knows cosine and sine of the states' angles."""
@@ -250,12 +263,19 @@ class TaskFormulas:
             return xp
         return Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
 
-    def named_state(self, y: Sequence) -> State:
-        """Return the entries of a state by name, and the velocities by coordinate."""
+    def named_state(self, y: Sequence, k: Any = None) -> State:
+        """Return the entries of a state by name, and places and velocities by coordinate.
+
+        Resting places are computed from recorded numbers, if given, or else from the scene's own.
+        """
         layout = layout_of(self._task.scene)
-        names = dict(zip(self.state, y, strict=False))
-        found = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
-        rates = {name: found[name] for name in layout.names if name in found}  # in the order of energies
+        entries = dict(zip(self.state, y, strict=False))
+        held = dict.fromkeys((p.name for p in layout.at("rest")), 0.0)
+        rests: dict[str, Any] = {}
+        if held:
+            rests = (self._task.scene if k is None else self._scene_with_numbers(k)).rests()
+        places = held | rests | {e.coordinate: entries[e.name] for e in layout.state if e.kind == "place"}
+        rates = held | {e.coordinate: entries[e.name] for e in layout.state if e.kind == "velocity"}
         carried = [e.name for e in layout.state if e.kind == "momentum"]
         why = ""
         if carried:
@@ -264,8 +284,11 @@ class TaskFormulas:
                 f"the state holds {', '.join(carried)} instead, as velocities jump with {movers}; "
                 f"write the formula with {carried[0]}"
             )
-        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates, why=why)}
-        return State("entry of the state", names, hidden)
+        return State(
+            entries,
+            _in_order("coordinate", layout.names, places),
+            _in_order("velocity of a coordinate", layout.names, rates, why),
+        )
 
     def named_targets(self, g: Sequence) -> Values:
         """Return the targets by name."""
@@ -282,10 +305,10 @@ class TaskFormulas:
                 result = getattr(task, name)(*arguments)
             except AttributeError as error:
                 names = layout_of(self._task.scene).names
-                if isinstance(error.obj, TracedNumber) and "v" in self.state and error.name in names:
-                    raise FormulaError(
-                        "after.v is the place of the coordinate 'v', which hides the velocities; rename it"
-                    ) from error
+                for hidden, what in (("q", "places"), ("v", "velocities")):
+                    if isinstance(error.obj, TracedNumber) and hidden in self.state and error.name in names:
+                        why = f"is the place of the coordinate {hidden!r}, which hides the {what}; rename it"
+                        raise FormulaError(f"after.{hidden} {why}") from error
                 if not isinstance(error.obj, ElementaryTrace):
                     raise
                 raise FormulaError(
@@ -330,7 +353,7 @@ class TaskFormulas:
         if type(self._task).guard is self._base.guard:
             return list(wanted.values())
         given = Values("control", wanted)
-        found = self._call("guard", k, given, self.named_state(y), k.dt, self._known(xp, y))
+        found = self._call("guard", k, given, self.named_state(y, k), k.dt, self._known(xp, y))
         if found is given:
             return list(given)
         if not isinstance(found, Mapping):
@@ -342,7 +365,7 @@ class TaskFormulas:
 
     def outcome(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
         """Return the reward, and whether the episode is over."""
-        ended = self._call("terminated", k, self.named_state(z), self.named_targets(g), self._known(xp, z))
+        ended = self._call("terminated", k, self.named_state(z, k), self.named_targets(g), self._known(xp, z))
         return self.reward(xp, y, z, u, g, k), ended
 
     def reward(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
@@ -355,7 +378,7 @@ class TaskFormulas:
 
     def _reward(self, name: str, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
         xp = self._known(xp, y, z)
-        before, after = self.named_state(y), self.named_state(z)
+        before, after = self.named_state(y, k), self.named_state(z, k)
         value = self._call(name, k, before, after, self._applied(u), self.named_targets(g), k.dt, xp)
         array = isinstance(value, np.ndarray) and isinstance(k.scale, TracedNumber)
         if value is None or array or isinstance(value, Mapping | Sequence | Values):
@@ -365,7 +388,7 @@ class TaskFormulas:
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
         """Return the state after a kick."""
         drawn = Values("random draw", {str(i): draw for i, draw in enumerate(draws)})
-        added = self._call("kick", k, self.named_state(z), drawn, self._known(xp, z))
+        added = self._call("kick", k, self.named_state(z, k), drawn, self._known(xp, z))
         if not isinstance(added, Mapping):
             self._refuse("kick", added, "changes of the state's entries by name")
         self._check_names("kick", "entry {!r} of the state", added, self.state)
@@ -382,7 +405,7 @@ class TaskFormulas:
 
     def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the observation."""
-        found = self._call("observe", k, self.named_state(y), self.named_targets(g), self._known(xp, y))
+        found = self._call("observe", k, self.named_state(y, k), self.named_targets(g), self._known(xp, y))
         if not isinstance(found, Mapping) or not found:
             raise FormulaError(f"{self._of}.observe must return numbers by name, in order, got {found!r:.60}")
         return [_counted(value) for value in found.values()]
@@ -417,7 +440,7 @@ class TaskFormulas:
             for value in values:
                 if not isinstance(value, TracedNumber | numbers.Real | np.bool_):
                     self._refuse(name, value, "a number" if "reward" in name else "numbers")
-        names = tuple(self._call("observe", k, self.named_state(y), self.named_targets(g), trace))
+        names = tuple(self._call("observe", k, self.named_state(y, k), self.named_targets(g), trace))
         for name, entries in (("guard", self._controls), ("observe", names)):
             for entry, value in zip(entries, found[name], strict=True):
                 if isinstance(value, numbers.Real):  # the same in every step
@@ -500,21 +523,30 @@ class TaskFormulas:
         return low, high
 
 
-def _taking_velocities(scene: Any, name: str) -> Callable:
-    """Return a formula of the scene that refuses a state in place of velocities.
+def _in_order(what: str, names: Sequence[str], known: Mapping[str, Any], why: str = "") -> Values:
+    """Return numbers by coordinate: in the order of energies, where none is missing before them."""
+    first = {name: known[name] for name in itertools.takewhile(known.__contains__, names)}
+    return Values(what, first, known, why=why)
 
-    Places have the names of velocities, and would be taken for them.
+
+def _taking_states(scene: Any, name: str) -> Callable:
+    """Return a formula of the scene that takes a state as places, and refuses one as velocities.
+
+    A state's entries have the names of places, but not their order; and they would be taken for velocities.
     """
-    method, position = getattr(scene, name), ARGUMENTS[name].index("v")
+    method = getattr(scene, name)
 
-    def checked(*given: Any, **named: Any) -> Any:
-        if isinstance(given[position] if len(given) > position else named.get("v"), State):
+    def taking(*given: Any, **named: Any) -> Any:
+        bound = inspect.signature(method).bind(*given, **named)
+        if isinstance(bound.arguments.get("v"), State):
             raise FormulaError(
                 f"self.scene.{name} is given the state in place of the velocities; give after.v or before.v"
             )
-        return method(*given, **named)
+        if isinstance(q := bound.arguments.get("q"), State):
+            bound.arguments["q"] = q.places
+        return method(*bound.args, **bound.kwargs)
 
-    return checked
+    return taking
 
 
 def _counted(value: Any) -> Any:
