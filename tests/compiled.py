@@ -19,12 +19,12 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C++ co
 
 @cache
 def folder():
-    return Path(tempfile.mkdtemp(prefix="lag-envs-kernels-"))
+    return tempfile.TemporaryDirectory(prefix="lag-envs-kernels-")  # removed with the process
 
 
 @cache
 def library(source):
-    name = folder() / hashlib.sha256(source.encode()).hexdigest()[:16]
+    name = Path(folder().name) / hashlib.sha256(source.encode()).hexdigest()[:16]
     text, made = name.with_suffix(".cpp"), name.with_suffix(".so")
     text.write_text(source)
     options = f"-std=c++17 -O1 -shared -fPIC {APART[1]} -Wall -Werror -Wno-unused-function"
