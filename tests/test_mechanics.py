@@ -14,12 +14,12 @@ from lag_envs.mechanics.algebra import (
     Atom,
     Expr,
     RecordedFunctions,
-    apply_identities,
     derivative,
     evaluate,
     function_of,
     substitute,
 )
+from lag_envs.mechanics.identities import apply_identities
 from lag_envs.scenes import Chain
 from lag_envs.stepping.general import series_code_of
 from lag_envs.stepping.lowering import Lowering

@@ -5,8 +5,8 @@ coefficients, so that equal terms are merged and terms that cancel leave nothing
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
 an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers and
 products of sums that change with the motion are not expanded, except squares and products whose terms may
-combine with others. Besides the rules of sums and products there are two more: √x² = x, and cos² + sin² = 1,
-which is applied to terms that agree in everything else (`apply_identities`).
+combine with others. Besides the rules of sums and products there is one more: √x² = x. Those of sine and
+cosine are applied on request (`lag_envs.mechanics.identities`).
 
 Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
 same bits in every process.
@@ -599,76 +599,6 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
             product = product * factor**n
         total = total + product
     return total
-
-
-def apply_identities(expr: Expr) -> Expr:
-    """Apply cos² + sin² = 1, and the addition formulas of cosine and sine, to terms that match.
-
-    Two terms match if they agree in all but a pair of factors and their coefficients have the same size. So
-    energies written in Cartesian velocities become as short as those written in angles.
-    """
-    terms = dict(expr.terms)
-    while True:
-        found = _meeting(terms)
-        if found is None:
-            return Expr(terms)
-        for change in found:
-            for monomial, c in change.items():
-                total = terms.get(monomial, 0) + c
-                if total:
-                    terms[monomial] = total
-                else:
-                    terms.pop(monomial, None)
-
-
-def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, int | Fraction]] | None:
-    """Return the changes of terms that one rule makes, or None if none applies."""
-    for monomial in sorted(terms, key=lambda m: [(a.text, n) for a, n in m]):
-        c = terms[monomial]
-        waves = [(a, n) for a, n in monomial if a.function in ("sin", "cos")]
-        for a, n in waves:
-            if a.function == "sin" and n >= 2:
-                partner = _exchange(monomial, {a: -2, _twin(a): 2})
-                d = terms.get(partner)
-                if d is not None and (c > 0) == (d > 0):
-                    common: Any = c if abs(Fraction(c)) < abs(Fraction(d)) else d
-                    return [{monomial: -common}, {partner: -common}, {_exchange(monomial, {a: -2}): common}]
-        for x, (a, _) in enumerate(waves):
-            for b, _ in waves[x + 1 :]:
-                if a.argument is b.argument or a.argument.same(b.argument):  # type: ignore[union-attr, arg-type]
-                    continue
-                partner = _exchange(monomial, {a: -1, b: -1, _twin(a): 1, _twin(b): 1})
-                d = terms.get(partner)
-                if d is None or abs(c) != abs(d) or partner == monomial:
-                    continue
-                rest = Expr({_exchange(monomial, {a: -1, b: -1}): c})
-                return [{monomial: -c}, {partner: -d}, (rest * _of_sum(a, b, c == d)).terms]
-    return None
-
-
-def _of_sum(a: Atom, b: Atom, alike: bool) -> Expr:
-    """Return a b ± (twin of a)(twin of b) as one function of a sum of angles."""
-    x, y = a.argument, b.argument
-    assert x is not None and y is not None
-    if a.function == b.function == "cos":
-        return function_of("cos", x - y if alike else x + y)
-    if a.function == b.function == "sin":
-        return function_of("cos", x - y) if alike else -function_of("cos", x + y)
-    if a.function == "cos":  # sin y cos x ± sin x cos y
-        return function_of("sin", y + x if alike else y - x)
-    return function_of("sin", x + y if alike else x - y)
-
-
-def _twin(atom: Atom) -> Atom:
-    return Atom("function", "cos" if atom.function == "sin" else "sin", atom.argument)
-
-
-def _exchange(monomial: Monomial, change: Mapping[Atom, int]) -> Monomial:
-    """Return the monomial with powers of some atoms changed."""
-    powers = dict(monomial)
-    for atom, n in change.items():
-        powers[atom] = powers.get(atom, 0) + n
-    return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text))
 
 
 def evaluate(exprs: Iterable[Expr], values: Mapping[Atom, Any], xp: Any) -> list:

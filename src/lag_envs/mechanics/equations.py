@@ -14,7 +14,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, derivative
+from lag_envs.mechanics.identities import apply_identities
 
 
 def place(name: str) -> Atom:

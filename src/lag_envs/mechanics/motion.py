@@ -13,8 +13,9 @@ from functools import cached_property
 from typing import Any
 
 from lag_envs.mechanics import recording
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, apply_identities, derivative, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, derivative, substitute
 from lag_envs.mechanics.equations import EquationsOfMotion, derive, place, velocity
+from lag_envs.mechanics.identities import apply_identities
 from lag_envs.mechanics.layout import Prescribed, SceneLayout
 from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
 
