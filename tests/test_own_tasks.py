@@ -571,21 +571,41 @@ def test_places_and_velocities_of_a_task_are_in_the_order_of_energies(places):
         def reward(self, before, after, control, target, dt, xp):
             return self.scene.potential(after, xp) - after.q.lift - after.v.lift
 
+        def reached(self, after, target, xp):
+            return self.scene.potential(after, xp) > 700.0
+
+        def terminated(self, after, target, xp):
+            return self.scene.potential(after, xp) > 700.0
+
     state = [0.1, 2.0, 0.3, 5.0, 0.2, 0.7]
-    for ceiling in (2.0, 4.0):
+    for ceiling, over in ((2.0, False), (2.5, True)):
         task = Hang(ceiling=ceiling)
         energy = task.scene.energy(state)
-        k = SimpleNamespace(**task.formulas.constants())
-        seen = task.formulas.observe(np, state, [], k)
+        seen = task.formulas.observe(np, state, [], SimpleNamespace(**task.formulas.constants()))
+        expected = [energy["kinetic"], energy["potential"], 0.3 + 0.1, 0.2 + 3.0 * ceiling]
         assert task.scene.state_names == ("s", "s_dot", "x", "x_dot", "y", "y_dot")
-        assert seen == pytest.approx(
-            [energy["kinetic"], energy["potential"], 0.3 + 0.1, 0.2 + 3.0 * ceiling], rel=1e-15
-        )
+        assert seen == pytest.approx(expected, rel=1e-15)
+        assert task.goal_holds([state]).tolist() == [over]
         env = LagrangianEnv(Hang, ceiling=ceiling)
-        env.reset(seed=0, options={"state": state})
+        if over:
+            with pytest.raises(ValueError, match="the episode would be over"):
+                env.reset(options={"state": state})
+            continue
+        env.reset(options={"state": state})
         _, reward, *_ = env.step([0.3])
         expected = env.scene.energy(env.state)["potential"] - 3.0 * ceiling
         assert reward == pytest.approx(expected, rel=1e-15)
+
+
+def test_a_start_as_fast_as_those_of_episodes_is_accepted():
+    class Thrown(own_tasks.Deliver):
+        start = {"x_dot": (-300.0, 5.0), "rope": (1.0, 0.1)}
+
+    env = LagrangianEnv(Thrown)
+    env.reset(seed=0)
+    env.reset(options={"state": env.state})
+    with pytest.raises(ValueError, match="x_dot must lie within ±305 m/s at the start, got 306 m/s"):
+        env.reset(options={"state": [0.0, 306.0, 1.0, 0.0, 0.0, 0.0]})
 
 
 def test_a_task_without_a_scene():

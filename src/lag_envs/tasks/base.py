@@ -29,7 +29,8 @@ from lag_envs.tasks.formulas import UNBOUNDED, TaskFormulas, control_of
 from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
 
-#: Largest speed of a given start, so that observation bounds can be proved [rad/s or m/s].
+#: Largest speed of a given start, so that observation bounds can be proved [rad/s or m/s]; larger ones are
+#: accepted where episodes start with them.
 FASTEST_START = 100.0
 #: Largest angle [rad] turned at the speed `Task.fastest` in a step. A step then needs far fewer substeps than
 #: are allowed, even after many steps have added to the speed.
@@ -284,7 +285,7 @@ class Task:
         numbers, ended = np.array([*state]), False
         # An ending that depends on the target is left to the first step.
         with contextlib.suppress(AttributeError, TypeError), np.errstate(all="ignore"):
-            ended = bool(self.terminated(self.formulas.named_state([*numbers]), None, np))
+            ended = bool(self.formulas.own().terminated(self.formulas.named_state([*numbers]), None, np))
         if ended:
             given = ", ".join(f"{n}={x:g}" for n, x in zip(self.scene.state_names, numbers, strict=True))
             raise ValueError(f"the episode would be over at {given}; give a state at which it continues")
@@ -442,9 +443,11 @@ class Task:
         """Return a given start as float64 array, or raise a ValueError if the task cannot start there."""
         array = check_state(self.scene, state)
         for entry, value in zip(layout_of(self.scene).state, array, strict=True):
-            if entry.kind != "place" and abs(value) > FASTEST_START:
+            centre, half = self.formulas.starts[entry.name]
+            fastest = max(FASTEST_START, abs(centre) + half)
+            if entry.kind != "place" and abs(value) > fastest:
                 raise ValueError(
-                    f"{entry.name} must lie within ±{FASTEST_START:g} {entry.unit} at the start, "
+                    f"{entry.name} must lie within ±{fastest:g} {entry.unit} at the start, "
                     f"got {value:g} {entry.unit}"
                 )
         self.check_start(
@@ -485,7 +488,7 @@ class Task:
         array, count = np.asarray(states), self.formulas.targets
         goals = np.zeros((len(array), count)) if targets is None else np.reshape(targets, (len(array), -1))
         after = self.formulas.named_state([*array.T])
-        holds = self.reached(after, self.formulas.named_targets([*goals.T][:count]), np)
+        holds = self.formulas.own().reached(after, self.formulas.named_targets([*goals.T][:count]), np)
         return np.broadcast_to(np.asarray(holds, np.bool_), len(array))
 
     def __getstate__(self) -> dict[str, Any]:

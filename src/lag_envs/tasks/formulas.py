@@ -253,6 +253,10 @@ class TaskFormulas:
         )
         return task
 
+    def own(self) -> Task:
+        """Return a copy of the task whose formulas can be called with its own numbers."""
+        return self.with_numbers(SimpleNamespace(**self.constants()))
+
     def _scene_with_numbers(self, k: Any) -> Any:
         scene = self._task.scene
         return twin(scene, {name: getattr(k, f"self_{name}") for name in parameter_names(scene)})
