@@ -85,7 +85,7 @@ class Deliver(Task):
 
 
 class Switched(Task):
-    """A chain of bars whose support is pushed left, right or not at all."""
+    """A chain of bars whose support is pushed left, right or not at all; the reward takes every function."""
 
     id = "OwnSwitched-v0"
     scene = Chain
@@ -98,7 +98,11 @@ class Switched(Task):
         return {name: after[name] for name in self.scene.state_names}
 
     def reward(self, before, after, control, target, dt, xp):
-        return xp.where(xp.cos(after.theta_3) < -0.5, 1.0, 0.0) - 0.01 * control[0] ** 2
+        up = xp.where(xp.cos(after.theta_3) < -0.5, 1.0, 0.0)
+        x, y = xp.sin(after.theta_1), after.theta_1_dot
+        smooth = xp.tan(x) + xp.atan(y) + xp.tanh(y) + xp.exp(-y * y) + xp.log(1.0 + y * y) + xp.sqrt(2.0 + x)
+        kinks = xp.floor(y) + xp.abs(x) + xp.minimum(x, y) - xp.maximum(x, 0.5 * y)
+        return up - 0.01 * control[0] ** 2 + 1e-3 * (smooth + kinks)
 
 
 class Drift(Task):

@@ -37,7 +37,7 @@ OPERATIONS: Mapping[str, tuple[str, str, str]] = {
     "where": ("{1} if {0} else {2}", "{} ? {} : {}", "{} ? {} : {}"),
     "sqrt": ("sqrt({0}) if {0} >= 0.0 else nan", "Math.sqrt({})", "sqrt({})"),
     "abs": ("abs({})", "Math.abs({})", "fabs({})"),
-    "floor": ("floor({})", "Math.floor({})", "Math.floor({})"),
+    "floor": ("floor({})", "Math.floor({})", "floor({})"),
     "pow2": ("pow2({})", "pow2({})", "pow2({})"),
     "exponent": ("exponent({})", "exponent({})", "exponent({})"),
     "copysign": ("copysign({}, {})", "copysign({}, {})", "copysign({}, {})"),
