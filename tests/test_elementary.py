@@ -14,12 +14,12 @@ import pytest
 from llvmlite import binding, ir
 from numba import njit, types
 from numba.extending import intrinsic
+from plain_target import evaluate_operations
 
 from lag_envs.stepping import elementary
-from lag_envs.stepping.compiling import compile_traced
 from lag_envs.stepping.elementary import LARGEST_ANGLE, ElementaryTrace
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.tracing import Trace, evaluate_operations
+from lag_envs.stepping.tracing import Trace
 
 # For each formula its exact values and the largest error allowed [ulp].
 EXACT = {
@@ -389,25 +389,6 @@ def test_code_for_every_processor_calls_nothing_and_fuses_only_what_is_recorded(
         assembly = machine.emit_assembly(binding.parse_assembly(str(module)))
         assert not re.search(r"^\s+(callq?|bl|jmp|b)\s", assembly, re.MULTILINE)
         assert fused == bool(re.search(r"^\s+v?fn?m(la|ls|add|sub)", assembly, re.MULTILINE))
-
-
-def test_fused_by_default_and_unfused_on_request():
-    def formula(xp, a, b):
-        return (a * b - 1.0,)
-
-    a = 1.0 + 2.0**-30
-    b = 1.0 - 2.0**-30
-    assert compile_traced("product", "a, b", formula)(a, b) == -(2.0**-60)
-    assert compile_traced("product", "a, b", formula, fused=False)(a, b) == 0.0
-
-
-def test_operations_on_other_numbers():
-    trace = Trace()
-    (x,) = trace.inputs("x")
-    operations, (result,) = trace.operations([trace.sqrt(x * x + 1.0) / x], fused=False)
-    with mpmath.workdps(40):
-        value = evaluate_operations(operations, {"x": mpmath.mpf(2)}, {"sqrt": mpmath.sqrt})[result]
-        assert abs(value - mpmath.sqrt(5) / 2) < mpmath.mpf(10) ** -39
 
 
 def test_trace_of_plain_arithmetic():

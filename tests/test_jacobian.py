@@ -97,10 +97,8 @@ def oracle(case):
     return np.array(columns).T
 
 
-@pytest.mark.parametrize(
-    ("kind", "n"),
-    [slow("task", 3), slow("damped", 40), slow("stiff", 40)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "n"), [("task", 3), ("damped", 40), ("stiff", 40)])
 def test_exact_flows(kind, n):
     """Each scene and control, with drag from gamma dt = 0 to 1e6: also with the drag as control."""
     for case in random_cases(kind, n, 41 + n):
@@ -129,16 +127,8 @@ HEAVY = {
 }
 
 
-#: Those that take seconds to compile or in exact arithmetic.
-LONG = (
-    "support at rest", "support driven", "no field", "shell turns", "shell turns without gravity",
-    "the control is the drag", "plane turns",
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case in LONG)) for case in HEAVY]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", HEAVY)
 def test_heavy_damping(case):
     name, given, state, control, dt = HEAVY[case]
     bar = {"mass": 0.2, "com_distance": 0.3, "gravity": 9.81, "track": math.inf}

@@ -16,6 +16,7 @@ import own_tasks
 import pytest
 from contract_scenes import Functions, Trolley
 from covering import slow
+from plain_target import Plain, evaluate_operations
 from test_imperfections import played
 from test_series import advance_in_python, in_python
 
@@ -33,8 +34,6 @@ from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
 from lag_envs.stepping.machine import LaneLayout
 from lag_envs.stepping.series import REACH, Series
-from lag_envs.stepping.target import Plain
-from lag_envs.stepping.tracing import evaluate_operations
 from lag_envs.tasks import arm
 
 #: Error of a control step, relative to the entry or to 1.

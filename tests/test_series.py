@@ -20,6 +20,7 @@ from contract_scenes import ElasticPendulum, Trolley
 from covering import every, slow
 from llvmlite import binding, ir
 from mpmath import mp, mpf
+from plain_target import Plain, evaluate_operations
 from series_systems import POINTS, SYSTEMS, System
 
 from lag_envs.mechanics.recording import parameter_values
@@ -41,8 +42,6 @@ from lag_envs.stepping.series import (
     Series,
     StepProgress,
 )
-from lag_envs.stepping.target import Plain
-from lag_envs.stepping.tracing import evaluate_operations
 
 NAMES = [system.name for system in SYSTEMS]
 FLOATS = types.SimpleNamespace(

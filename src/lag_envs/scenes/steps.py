@@ -216,7 +216,7 @@ def pulled(
     return found
 
 
-def check_turns(scene: Scene, states: Array, rows: Sequence[int] | None = None) -> None:
+def check_turns(scene: Scene, states: Array) -> None:
     """Raise StepRefused where a gradient needs sine and cosine of an angle that is too large for them.
 
     Steps of scenes with a flow of their own go further than their gradients.
@@ -225,7 +225,7 @@ def check_turns(scene: Scene, states: Array, rows: Sequence[int] | None = None) 
         if unit == "rad" and (far := np.abs(column) > LARGEST_ANGLE).any():
             i = int(np.argmax(far))
             raise StepRefused(
-                f"the gradient of row {i if rows is None else rows[i]} needs sine and cosine of "
+                f"the gradient of row {i} needs sine and cosine of "
                 f"{name}={column[i]:.9g}, which are not computed beyond {LARGEST_ANGLE:g} rad; "
                 f"subtract whole turns from {name}"
             )

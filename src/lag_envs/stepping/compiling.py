@@ -131,7 +131,7 @@ def compile_python(
 
 
 def compile_traced(
-    name: str, arguments: str, formula: Callable, absent: frozenset[str] = frozenset(), *, fused: bool = True
+    name: str, arguments: str, formula: Callable, absent: frozenset[str] = frozenset()
 ) -> Callable:
     """Run ``formula(xp, *arguments)`` once on recording numbers and compile the recorded operations.
 
@@ -145,13 +145,11 @@ def compile_traced(
         Takes the `Trace` as namespace and one `TracedNumber` per argument; returns a tuple of numbers.
     absent : frozenset of str
         Arguments that are known to be zero.
-    fused : bool
-        Whether to fuse products with sums, see `Trace.operations`.
     """
     trace = Trace()
     names = arguments.split(", ")
     outputs = formula(trace, *(trace.zero() if n in absent else trace.inputs(n)[0] for n in names))
     names = [f"out{i}" for i in range(len(outputs))]
-    lines, values = record_block(trace, dict(zip(names, outputs, strict=True)), fused=fused)
+    lines, values = record_block(trace, dict(zip(names, outputs, strict=True)))
     body = [f"def {name}({arguments}):", *lines, f"return {', '.join(map(str, values))}"]
     return compile_function(name, "\n    ".join(body) + "\n")

@@ -204,7 +204,7 @@ class SeriesStepper:
     def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> StepCode:
         """Return the step without the terms of constants that are zero.
 
-        Unfused, it has the same bits as plain + - * / √ and comparisons on any machine; see `Plain`.
+        Unfused, it has the same bits as plain + - * / √ and comparisons on any machine.
         """
         if (absent, fused) not in self._codes:
             self._codes[absent, fused] = StepCode(self, self.record(absent, fused), absent, fused)

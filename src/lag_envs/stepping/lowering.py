@@ -397,12 +397,6 @@ class Lowering:
         self._differentiate(_weights(self.nodes, entries))
         return right, entries
 
-    def record(
-        self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr], fused: bool = True
-    ) -> SeriesRecord:
-        """Return the record of ``Σ_j mass[i, j] a_j = force[i]``; see `parts` and `without`."""
-        return self.without(*self.parts(mass, force), fused=fused)
-
     def without(
         self, right: list[int], entries: dict, zero: frozenset[str] = frozenset(), fused: bool = True
     ) -> SeriesRecord:
@@ -426,9 +420,6 @@ class Lowering:
         now: dict[int, int] = {-1: -1}  # -1: the series vanishes
         nodes: list[Node] = []
 
-        def alias(old: int) -> int:
-            return now[old]
-
         def vanish(i: int) -> None:
             """Leave a series out, or keep it as a zero if it is an argument of a function."""
             now[i] = len(nodes) if i in arguments else -1
@@ -440,7 +431,7 @@ class Lowering:
         for i, (op, args, ws, index) in enumerate(self.nodes):
             numbers = tuple(next(value) for _ in ws)
             if op == "sum":
-                pairs = [(alias(a), w) for a, w in zip(args, numbers[:-1], strict=True)]
+                pairs = [(now[a], w) for a, w in zip(args, numbers[:-1], strict=True)]
                 pairs = [(a, w) for a, w in pairs if a >= 0 and w != 0.0]
                 if not pairs and numbers[-1] == 0.0:
                     vanish(i)

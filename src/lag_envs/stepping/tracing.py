@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import numbers
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -259,7 +259,7 @@ class Trace:
 
         The operations are in order, without those that no output needs. Inputs named in `zeros` are known to
         be zero, like the numbers that `zero` returns. With ``fused=False`` no product is fused with a sum:
-        then all operations round alike on every machine and in every language (see `evaluate_operations`).
+        then all operations round alike on every machine and in every language.
         """
         outputs = list(outputs)
         results = [_name(value) for value in outputs]
@@ -354,45 +354,6 @@ class Trace:
     def copysign(self, a: Any, sign: Any) -> Any:
         """Return a with the sign of another number, which may be a signed zero."""
         return self.record("copysign", a, sign)
-
-
-def evaluate_operations(
-    operations: Iterable[Operation],
-    values: Mapping[str, Any],
-    functions: Mapping[str, Callable] | None = None,
-) -> dict[str, Any]:
-    """Carry out recorded operations on Python's floats, or on other numbers.
-
-    Unfused operations without sin, cos, exp and log give the same bits as compiled code; so do fused ones,
-    but slowly.
-
-    Parameters
-    ----------
-    operations : iterable of Operation
-        The operations.
-    values : mapping of str to number
-        The inputs by name.
-    functions : mapping of str to callable, optional
-        Replacements for some operations, such as ``{"sqrt": mpmath.sqrt}``.
-
-    Returns
-    -------
-    dict of str to number
-        The inputs and all results by name.
-
-    Examples
-    --------
-    >>> trace = Trace()
-    >>> a, b = trace.inputs("a", "b")
-    >>> operations, results = trace.operations([a / b + 1.0], fused=False)
-    >>> evaluate_operations(operations, {"a": 1.0, "b": -0.0})[results[0]]
-    -inf
-    """
-    table = IEEE | dict(functions or {})
-    known = dict(values)
-    for name, op, args in operations:
-        known[name] = table[op](*(known[a] if isinstance(a, str) else a for a in args))
-    return known
 
 
 def sum_of_products(factors: Iterable[tuple[Any, Any]]) -> Any:
