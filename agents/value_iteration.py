@@ -321,7 +321,7 @@ class DynamicProgramme:
     def solve(
         self, folder: Path | None = None, *, new: bool = False, label: str = "", quiet: bool = False
     ) -> NDArray[np.float32]:
-        """Return V_t at all nodes for t = 0 ... T, shape (T + 1, *grid.shape); see `open_cache`.
+        """Return V_t at all nodes for t = 0 ... T, shape (T + 1, *grid.shape); see `ValueCache`.
 
         Parameters
         ----------

@@ -349,7 +349,7 @@ def test_mechanics_says_how_prescribed_coordinates_are_moved():
 
     found = Rail().mechanics
     assert [(p.name, p.level, p.control) for p in found.prescribed] == [
-        ("a", "acceleration", "a_ddot"), ("b", "rate", "b_dot"), ("c", "place", "c"), ("d", "rest", None)
+        ("a", "acceleration", "a_ddot"), ("b", "rate", "b_dot"), ("c", "place", "c"), ("d", "rest", "")
     ]  # fmt: skip
     assert found.free == ("x",)
     kinds = {(s.kind, s.name) for s in found.force[0].symbols()}

@@ -94,7 +94,7 @@ def test_numbers_are_those_of_the_environment(env_id, mode):
     assert torch.isfinite(slope).all() and slope.abs() > 0.0
 
 
-def test_outputs_share_memory():
+def test_types_of_results():
     envs = TorchVectorEnv(IDS[0], 3)
     observations, _ = envs.reset(seed=0)
     results = envs.step(torch.zeros(3, 1))
@@ -135,7 +135,7 @@ def test_no_gradient_through_an_end(mode):
     assert (slope[:3] != 0.0).all()
 
 
-def test_windows():
+def test_detach_cuts_gradients():
     envs = TorchVectorEnv(IDS[0], 2)
     envs.reset(seed=0)
     first, second = (torch.full((2, 1), 0.5, requires_grad=True) for _ in range(2))

@@ -82,14 +82,10 @@ def _controls(task: Task) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     top = task.formulas.largest
     for acting in task.formulas.acting:
-        unit = units.pop(acting.control)
-        if acting.values:
-            given = f"{', '.join(f'{v:g}' for v in acting.values)} {unit}"
-            rows.append((acting.control, given, f"actions 0 to {len(acting.values) - 1}"))
-        else:
-            rows.append(
-                (acting.control, f"{acting.low:g} to {acting.high:g} {unit}", f"actions {-top:g} to {top:g}")
-            )
+        del units[acting.control]
+        given = ", ".join(f"{v:g}" for v in acting.values) or f"{acting.low:g} to {acting.high:g}"
+        actions = f"0 to {len(acting.values) - 1}" if acting.values else f"{-top:g} to {top:g}"
+        rows.append((acting.control, f"{given} {acting.unit}", f"actions {actions}"))
     return rows + [(name, f"0 {unit}", "no action sets it") for name, unit in units.items()]
 
 

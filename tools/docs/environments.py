@@ -154,12 +154,11 @@ def by_scene(source: Callable[[str], str]) -> str:
 
 def _range(task: Task, acting: Any) -> str:
     """Return a control's values in words."""
-    unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
     if acting.values:
-        return f"`{acting.control}` {', '.join(map(number_text, acting.values))} {unit}"
+        return f"`{acting.control}` {', '.join(map(number_text, acting.values))} {acting.unit}"
     if acting.low == -acting.high:
-        return f"`{acting.control}` ±{number_text(acting.high)} {unit}"
-    return f"`{acting.control}` {number_text(acting.low)} to {number_text(acting.high)} {unit}"
+        return f"`{acting.control}` ±{number_text(acting.high)} {acting.unit}"
+    return f"`{acting.control}` {number_text(acting.low)} to {number_text(acting.high)} {acting.unit}"
 
 
 # --- parts of a page ----------------------------------------------------------------------------------------
@@ -204,13 +203,12 @@ def _box(space: Any) -> str:
 
 
 def _actions(task: Task) -> str:
-    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     rows = []
     for i, acting in enumerate(task.formulas.acting):
         ends = acting.values or (acting.low, acting.high)
         values = [", ".join(map(number_text, ends)), ""] if acting.values else [*map(number_text, ends)]
         _, meaning = task.quantities.get(acting.control, ("", ""))
-        rows.append([str(i), f"`{acting.control}`", meaning, units[acting.control], *values])
+        rows.append([str(i), f"`{acting.control}`", meaning, acting.unit, *values])
     top = task.formulas.largest
     listed = any(acting.values for acting in task.formulas.acting)
     head = [

@@ -17,7 +17,7 @@ from lag_envs.envs.model import Model
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.scenes import Scene
 from lag_envs.scenes.derivation import code_of, form_of, motion_constants_of, step_argument_of
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import compile_lines, indent
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.tasks import TASKS
 from lag_envs.workers import stopping_point
@@ -58,14 +58,13 @@ def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
         f"total += {' + '.join(code.end[:n])}",
     ]
     body = [
-        f"def steps({', '.join(['states', 'controls', 'dt', *held])}):",
         *([f"rows = np.zeros({code.scratch})"] if general else []),
         "total = 0.0",
         "for i in range(states.shape[0]):",
-        *("    " + line for line in loop),
+        *indent(loop),
         "return total",
     ]
-    steps = compile_function("steps", "\n    ".join(body) + "\n", code.compile())
+    steps = compile_lines("steps", ", ".join(["states, controls, dt", *held]), body, code.compile())
     limit = step_argument_of(scene, dt)
     return lambda states, controls: steps(states, controls, dt, limit, *numbers)
 

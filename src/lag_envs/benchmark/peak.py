@@ -19,7 +19,7 @@ from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
-from lag_envs.stepping.compiling import compile_function, count_operations
+from lag_envs.stepping.compiling import compile_lines, count_operations
 
 #: How many numbers, few enough for the nearest cache, and multiply-adds on each, so many that loads do not
 #: matter.
@@ -30,15 +30,14 @@ PRODUCTS = frozenset({"*", "a*b+c", "a*b-c", "c-a*b"})
 @cache
 def _compiled() -> Callable:
     lines = [
-        "def multiply_adds(numbers, n):",
-        "    wide_vectors()",
-        "    for _ in range(n):",
-        f"        for i in range({NUMBERS}):",
-        "            x = numbers[i]",
-        *["            x = fma(x, 0.5, 1.0)"] * TIMES,
-        "            numbers[i] = x",
+        "wide_vectors()",
+        "for _ in range(n):",
+        f"    for i in range({NUMBERS}):",
+        "        x = numbers[i]",
+        *["        x = fma(x, 0.5, 1.0)"] * TIMES,
+        "        numbers[i] = x",
     ]
-    return compile_function("multiply_adds", "\n".join(lines) + "\n")
+    return compile_lines("multiply_adds", "numbers, n", lines)
 
 
 def peak() -> Callable[[int], int]:

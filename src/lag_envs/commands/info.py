@@ -43,9 +43,8 @@ def _line(id: str) -> tuple[str, ...]:
 
 def _range(task: Task, acting: Any) -> str:
     """Return a control's name, its range or choices, and its unit."""
-    unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
     given = " or ".join(f"{value:g}" for value in acting.values) or f"{acting.low:g} to {acting.high:g}"
-    return f"{acting.control} {given} {unit}".rstrip()
+    return f"{acting.control} {given} {acting.unit}".rstrip()
 
 
 def declare_info(parser: argparse.ArgumentParser) -> None:

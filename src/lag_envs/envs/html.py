@@ -40,13 +40,12 @@ def environment_html(
             f'<img alt="{escape(about)}" width="{width // 2}" height="{height // 2}" '
             f'src="data:image/png;base64,{data}">'
         )
-    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     rows = [(name, str(space)) for name, space in spaces.items()]
     rows.append(("observed", ", ".join(task.observation)))
     for acting in task.formulas.acting:
         given = acting.values or (acting.low, acting.high)
         between = ", " if acting.values else " to "
-        rows.append((acting.control, f"{between.join(f'{v:g}' for v in given)} {units[acting.control]}"))
+        rows.append((acting.control, f"{between.join(f'{v:g}' for v in given)} {acting.unit}"))
     rows += [
         ("control interval", f"{task.dt:g} s"),
         ("episode", f"{task.limit:g} steps, {task.duration:g} s"),

@@ -53,7 +53,7 @@ INLINE word mixed(word z) {{
 }}
 INLINE word episode_key(word key, word episode) {{ return mixed(mixed(key) + episode * {GOLDEN:#x}ull); }}
 INLINE real uniform(word key, word step, word index) {{
-  const word z = mixed(key + (step * {_DRAWS} + index + 1) * {GOLDEN:#x}ull);
+  const word z = mixed(key + (step * {DRAWS} + index + 1) * {GOLDEN:#x}ull);
   return real(z >> (64 - DIGITS)) / real(1ull << DIGITS);
 }}
 """

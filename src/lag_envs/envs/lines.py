@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import indent
 from lag_envs.stepping.flows import section
 from lag_envs.stepping.tracing import Trace
 
@@ -38,16 +38,3 @@ def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
 def indented(head: str, body: Sequence[str]) -> list[str]:
     """Put lines under a header."""
     return [head, *indent(body)]
-
-
-def indent(lines: Sequence[str]) -> list[str]:
-    """Indent lines."""
-    return ["    " + line for line in lines]
-
-
-def compiled_lines(
-    name: str, arguments: str, body: Sequence[str], *helpers: Callable, inner: bool = False
-) -> Callable:
-    """Compile a function of these lines; see `compile_function`."""
-    source = "\n".join([f"def {name}({arguments}):", *indent(body), ""])
-    return compile_function(name, source, *helpers, inner=inner)

@@ -25,20 +25,14 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs import sharing
-from lag_envs.envs.lines import (
-    EACH_LANE,
-    compiled_lines,
-    draw_lines,
-    indent,
-    indented,
-    next_episode,
-    recorded_lines,
-)
-from lag_envs.stepping.compiling import BLOCK
+from lag_envs.envs.lines import EACH_LANE, draw_lines, indented, next_episode, recorded_lines
+from lag_envs.stepping import primitives
+from lag_envs.stepping.compiling import BLOCK, compile_lines, indent
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.rows import Rows
 
-DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
+#: Random numbers reserved for one step.
+DRAWS = int(primitives.DRAWS)
 SLOW = -3  #: status of a step that the fast formula does not cover
 
 
@@ -230,7 +224,7 @@ class Program:
             *self._command_one, *self._move_one, *self._finish_one(),
         ]  # fmt: skip
         helpers = [self._stepper.engine()] if self.tries_all else []
-        return compiled_lines("step_one", "f, obs, a, ids", body, *helpers)
+        return compile_lines("step_one", "f, obs, a, ids", body, *helpers)
 
     @property
     def _move_one(self) -> list[str]:
@@ -274,7 +268,7 @@ class Program:
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step after `advance` has filled in the rows ``z``."""
         rows = self._one.load([*self.y, *self.z, *self.g, *self.u, *self.reaching, "n"])
-        return compiled_lines(
+        return compile_lines(
             "finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()]
         )
 
@@ -287,7 +281,7 @@ class Program:
             *next_episode("0", "1", "2"), *self._start, *self._begin_one, *self._show_one,
             *self._one.store([*self.y, *self.g, *self.u, "n", *self.drawn]),
         ]  # fmt: skip
-        return compiled_lines("start_one", "f, obs, ids, state_given, target_given", body)
+        return compile_lines("start_one", "f, obs, ids, state_given, target_given", body)
 
     @cached_property
     def advance(self) -> Callable:
@@ -325,7 +319,7 @@ class Program:
             "return 0",
         ]  # fmt: skip
         arguments = "states, actions, targets, par, ends, rewards, ended"
-        return compiled_lines("model", arguments, body, self._stepper.engine())
+        return compile_lines("model", arguments, body, self._stepper.engine())
 
     @property
     def room(self) -> int:
@@ -487,7 +481,7 @@ class Program:
             ]),
         ]  # fmt: skip
         engine = self._stepper.compile_block if self.general else self._stepper.engine
-        return compiled_lines(
+        return compile_lines(
             "step_blocks", sharing.STEP_BLOCKS, body, engine(), *sharing.claiming(), inner=True
         )
 
@@ -627,7 +621,7 @@ class Program:
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
             *indent([*self._place, self._base, *indented(EACH_LANE, start)]),
         ]  # fmt: skip
-        return compiled_lines(
+        return compile_lines(
             "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
         )
 

@@ -101,7 +101,7 @@ class UnfusedProgram:
 
     Attributes
     ----------
-    rows : Rows
+    rows : ScriptRows
         The places of the numbers.
     given : dict of str to float
         The constants that the script is given, in order; they come first. One of them, ``strength``,

@@ -122,7 +122,7 @@ def distance(a: PlayedPolicy, b: PlayedPolicy, error: float) -> Distance:
 
     Parameters
     ----------
-    a, b : Track
+    a, b : PlayedPolicy
         Their tracks in the same episodes.
     error : float
         Standard error of a mean return on their board.

@@ -43,7 +43,7 @@ def combined(boards: Mapping[str, Mapping[AgentIdentity, AgentScore]]) -> list[d
 
     Parameters
     ----------
-    boards : mapping of str to mapping of Agent to Result
+    boards : mapping of str to mapping of AgentIdentity to AgentScore
         For each board the ranked agents.
 
     Returns

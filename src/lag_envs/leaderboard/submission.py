@@ -95,7 +95,7 @@ class Submission(About):
 
     Parameters
     ----------
-    policies : tuple of (int, Policy)
+    policies : tuple of (int, SubmittedPolicy)
         Training seed and policy, by increasing seed.
     folder : Path
         Where it was read.

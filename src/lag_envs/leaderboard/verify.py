@@ -61,12 +61,12 @@ def verify(
     Returns
     -------
     dict
-        Of JSON types, as in `results.Result`: env, digest, nonce, episodes, policies, robustness, often,
-        seconds, machine, versions, build. ``policies`` has for each one its seed, the episodes' returns,
-        successes, times [s] (None if the goal was not reached) and efforts (mean of (u/U)²), a hash of all
-        actions, rewards and ends, and the returns of the environment's ``reference`` in the same episodes, if
-        it has one. ``robustness`` maps disturbances to the policies' mean returns; ``often`` has those for
-        acting ten times as often, None for an agent that counts steps and cannot.
+        Of JSON types, as in `results.VerificationResult`: env, digest, nonce, episodes, policies,
+        robustness, often, seconds, machine, versions, build. ``policies`` has for each one its seed, the
+        episodes' returns, successes, times [s] (None if the goal was not reached) and efforts (mean of
+        (u/U)²), a hash of all actions, rewards and ends, and the returns of the environment's ``reference``
+        in the same episodes, if it has one. ``robustness`` maps disturbances to the policies' mean returns;
+        ``often`` has those for acting ten times as often, None for an agent that counts steps and cannot.
 
     Raises
     ------

@@ -12,7 +12,7 @@ that moves or holds it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, derivative
 from lag_envs.mechanics.identities import apply_identities
@@ -108,13 +108,19 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
     force = []
     for name, momentum in zip(names, momenta, strict=True):
         q, v = place(name), velocity(name)
-        convective = Expr({})
-        for other in names:
-            convective = convective + derivative(momentum, place(other)) * velocity(other)
+        convective = time_derivative(momentum, names)
         total = derivative(kinetic, q) - convective - derivative(energies.potential, q)
         total = total - derivative(energies.dissipation, v) + energies.applied.get(name, Expr({}))
         force.append(apply_identities(total))
     return EquationsOfMotion(names, mass, tuple(force))
+
+
+def time_derivative(expr: Expr, names: Iterable[str]) -> Expr:
+    """Return Σ ∂e/∂q q', the time derivative as far as it comes from these places."""
+    total = Expr({})
+    for name in names:
+        total = total + derivative(expr, place(name)) * velocity(name)
+    return total
 
 
 def _check_velocities(kinetic: Expr) -> None:

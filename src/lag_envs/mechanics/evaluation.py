@@ -220,7 +220,7 @@ class MotionPoint:
         self.values: dict[Atom, Any] = dict(parameters)
         self.values |= {control(name): x for name, x in zip(layout.controls, controls, strict=True)}
         for name, level, by in layout.prescribed:
-            moves = self.values.get(control(by or ""), 0.0)
+            moves = self.values.get(control(by), 0.0)
             rest = mechanics.record.rests.get(name, Expr({})) if level == "rest" else Expr({})
             self.values[place(name)] = moves if level == "place" else self.of([rest])[0]
             self.values[velocity(name)] = moves if level == "rate" else 0.0
@@ -240,7 +240,7 @@ class MotionPoint:
         free = self.solve(self.of(mechanics.force))
         self.acceleration = dict(zip(layout.free, free, strict=True))
         for name, level, by in layout.prescribed:
-            self.acceleration[name] = self.values[control(by or "")] if level == "acceleration" else 0.0
+            self.acceleration[name] = self.values[control(by)] if level == "acceleration" else 0.0
 
     def of(self, exprs: Sequence[Expr]) -> list:
         """Evaluate expressions."""

@@ -25,11 +25,11 @@ _ENDINGS: tuple[tuple[str, Level], ...] = (("_ddot", "acceleration"), ("_dot", "
 
 
 class Prescribed(NamedTuple):
-    """A coordinate that is moved, or held, from outside."""
+    """A coordinate that is moved, or held, from outside; one that rests has the control ``""``."""
 
     name: str
     level: Level
-    control: str | None
+    control: str
 
 
 class StateEntry(NamedTuple):
@@ -58,7 +58,7 @@ class SceneLayout:
         Controls of the mode.
     absent : tuple of str
         Controls of other modes, which read 0.
-    state : tuple of Entry
+    state : tuple of StateEntry
         Entries of the state.
     left_out : tuple of str
         Entries that the state leaves out.
@@ -215,7 +215,7 @@ def _held(of: str, name: str, driven: Mapping[str, str]) -> Prescribed:
         raise FormulaError(
             f"{of}: the controls {found[0][0]!r} and {found[1][0]!r} both set {name!r}; keep one of them"
         )
-    return Prescribed(name, found[0][1], found[0][0]) if found else Prescribed(name, "rest", None)
+    return Prescribed(name, found[0][1], found[0][0]) if found else Prescribed(name, "rest", "")
 
 
 def _full_state(free: dict, moved: dict, held: Sequence[Prescribed]) -> list[StateEntry]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, derivative, substitute
-from lag_envs.mechanics.equations import EquationsOfMotion, derive, place, velocity
+from lag_envs.mechanics.equations import EquationsOfMotion, derive, place, time_derivative, velocity
 from lag_envs.mechanics.identities import apply_identities
 from lag_envs.mechanics.layout import Prescribed, SceneLayout
 from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
@@ -31,7 +31,7 @@ class Mechanics:
 
     Attributes
     ----------
-    layout : Layout
+    layout : SceneLayout
         Names of coordinates, controls and state.
     record : Record
         The formulas, with parameters that are 0 put in.
@@ -86,22 +86,15 @@ class Mechanics:
         """A hash of `text`."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
-    def _rate(self, expr: Expr) -> Expr:
-        """Return the time derivative of a function of the places."""
-        total = Expr({})
-        for name in self.layout.names:
-            total = total + derivative(expr, place(name)) * velocity(name)
-        return total
-
     @cached_property
     def mass_rate(self) -> tuple[Expr, ...]:
         """The time derivatives of `entries`."""
-        return tuple(self._rate(entry) for entry in self.entries())
+        return tuple(time_derivative(entry, self.layout.names) for entry in self.entries())
 
     @cached_property
     def coupling_rate(self) -> dict[tuple[int, str], Expr]:
         """The time derivatives of `coupling`."""
-        return {key: self._rate(entry) for key, entry in self.coupling.items()}
+        return {key: time_derivative(entry, self.layout.names) for key, entry in self.coupling.items()}
 
     @cached_property
     def _known(self) -> dict[Atom, Expr]:
@@ -162,11 +155,11 @@ def _held(layout: SceneLayout, record: Record) -> dict[Atom, Expr]:
         if level == "rest":
             values[place(name)] = record.rests.get(name, Expr.of(0))
         if level == "place":
-            values[place(name)] = Expr.of(control(by or ""))
+            values[place(name)] = Expr.of(control(by))
         if level in ("rest", "place"):
             values[velocity(name)] = Expr.of(0)
         if level == "rate":
-            values[velocity(name)] = Expr.of(control(by or ""))
+            values[velocity(name)] = Expr.of(control(by))
     return values
 
 
@@ -177,7 +170,7 @@ def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Colle
     ----------
     scene : Scene
         The scene: its class's name for error messages, and its parameters that are 0.
-    layout : Layout
+    layout : SceneLayout
         Its names.
     found : Record
         Its formulas.
@@ -217,12 +210,12 @@ def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Colle
         for i in range(n):
             entry = equations.entry(i, m)
             if by.level == "acceleration":
-                force[i] = force[i] - entry * Expr.of(control(by.control or ""))
+                force[i] = force[i] - entry * Expr.of(control(by.control))
             elif entry.terms:
                 coupling[i, name] = entry
     mass = {(i, j): entry for (i, j), entry in equations.mass.items() if j < n}
     force = [substitute(f, held) for f in force]
-    _check_left_out(of, layout, {**{k: e for k, e in mass.items()}, **coupling}, force)
+    _check_left_out(of, layout, {**mass, **coupling}, force)
     return Mechanics(layout, found, mass, tuple(force), coupling, tuple(sorted(atom.name for atom in zero)))
 
 

@@ -98,7 +98,7 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
 
 
 def scales(case: Case, dt: float) -> list[float]:
-    """Return the size by which each state entry's error is divided, as README defines accuracy.
+    """Return the size by which each state entry's error is divided, as docs/numerics.md defines accuracy.
 
     For angles and lengths max(1, |q|, |q'| dt), for their rates max(1, |q'|, the field's contribution).
     """

@@ -19,7 +19,7 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import motion_constants_of
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import compile_lines
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -107,7 +107,6 @@ def compile_march(scene: Stepped) -> Callable:
     code = scene.stepper()
     width = len(code.start)
     lines = [
-        f"def march(out, marks, dt, x{''.join(f', {name}' for name in code.constants)}):",
         f"{', '.join(code.start)}, = {', '.join(f'out[-1, {i}]' for i in range(width))},",
         "u0 = 0.0",
         "done = 0",
@@ -120,7 +119,8 @@ def compile_march(scene: Stepped) -> Callable:
         *(f"    out[j, {i}] = {name}" for i, name in enumerate(code.start)),
         "return marks.shape[0]",
     ]
-    return compile_function("march", "\n    ".join(lines) + "\n", code.compile())
+    arguments = ", ".join(["out, marks, dt, x", *code.constants])
+    return compile_lines("march", arguments, lines, code.compile())
 
 
 def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -127,7 +127,7 @@ def episode_errors(
 
     Parameters
     ----------
-    episode : Episode
+    episode : RecordedEpisode
         The recorded episode.
     step : callable
         Repeats every step by itself, from the recorded state.

@@ -139,7 +139,7 @@ class FormulaSeries:
 
     Parameters
     ----------
-    formulas : Formulas
+    formulas : OperationList
         The expressions to compute.
     given : sequence of list of flint.arb
         Coefficients of the inputs, which the caller extends; the held ones, at the end, have one.

@@ -213,7 +213,7 @@ def _summary(found: Mapping[tuple, Mapping[str, BestSetting]]) -> Table | None:
     rows = []
     for system, target, here in _cases(found, "single"):
         if target in (1e-6, 1e-12):
-            together = found[system, "batch", target]
+            together = found.get((system, "batch", target), {})
             cells = [_cell(here, name) for name in COLUMNS[:5]]
             rows.append((system, f"{target:g}", _cell(here, "lag_envs"), _cell(together, "lag_envs"), *cells,
                          _cell(together, "heyoka")))  # fmt: skip

@@ -20,7 +20,7 @@ from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import BLOCK, Sample, blocks, unblocked
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import compile_lines
 from lag_envs.stepping.general import series_code_of
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class SceneEquation(Equation):
         for p in layout.at("acceleration", "rate"):
             turns = place(p.name) in symbols, velocity(p.name) in symbols
             if any(turns) and p.control not in found:
-                found.append(p.control or "")
+                found.append(p.control)
             found += [p.name] * turns[0]
             found += [f"{p.name}_dot"] * (p.level == "acceleration" and any(turns))
         return tuple(found)
@@ -85,7 +85,7 @@ class SceneEquation(Equation):
         values |= {place(name): y[i] for i, name in enumerate(layout.free)}
         values |= {velocity(name): y[n + i] for i, name in enumerate(layout.free)}
         for moved in layout.at("acceleration", "rate"):
-            held = given.get(moved.control or "", 0.0)
+            held = given.get(moved.control, 0.0)
             if moved.level == "acceleration":
                 rate, push = given.get(f"{moved.name}_dot", 0.0), held
             else:
@@ -147,7 +147,7 @@ class SceneProblems(Problems):
         v = self._v | dict(zip(layout.free, y[n : 2 * n], strict=True))
         held = dict(zip(layout.controls, self.controls.T, strict=True))
         for p in layout.at("acceleration", "rate"):
-            push = held[p.control or ""] if p.level == "acceleration" else 0.0
+            push = held[p.control] if p.level == "acceleration" else 0.0
             q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * push))
             v[p.name] = v[p.name] + span * push
         v = self._shifted(q, v, 1.0)
@@ -201,7 +201,6 @@ class CertifiedSeries(Rival):
 def _alone(code: Any, tolerance: float) -> Callable:
     """Compile ``alone(starts, controls, ends, dt, order, constants...)``: a control step from each state."""
     lines = [
-        f"def alone(starts, controls, ends, dt, order{''.join(f', {name}' for name in code.constants)}):",
         f"rows = np.zeros({code.scratch})",
         "refused = 0",
         "for j in range(starts.shape[0]):",
@@ -212,7 +211,8 @@ def _alone(code: Any, tolerance: float) -> Callable:
         *(f"    ends[j, {i}] = {y}" for i, y in enumerate(code.start)),
         "return refused",
     ]
-    return compile_function("alone", "\n    ".join(lines) + "\n", code.compile(tolerance))
+    arguments = ", ".join(["starts, controls, ends, dt, order", *code.constants])
+    return compile_lines("alone", arguments, lines, code.compile(tolerance))
 
 
 @cache
@@ -232,7 +232,6 @@ def _batch(code: Any, tolerance: float) -> Callable:
     lanes = f"for i in range(np.uint64({BLOCK})):"
     load = [f"        {name} = {at(rows[name])}" for name in names]
     lines = [
-        f"def batch(memory, count, dt, order{''.join(f', {name}' for name in code.constants)}):",
         "wide_vectors()",
         "refused = 0",
         f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
@@ -252,4 +251,5 @@ def _batch(code: Any, tolerance: float) -> Callable:
         *(f"        {at(rows[y])} = {z}" for y, z in zip(code.start, code.end, strict=True)),
         "return refused",
     ]
-    return compile_function("batch", "\n    ".join(lines) + "\n", code.compile_block(tolerance))
+    arguments = ", ".join(["memory, count, dt, order", *code.constants])
+    return compile_lines("batch", arguments, lines, code.compile_block(tolerance))

@@ -20,7 +20,7 @@ def write_report(found: dict[str, Any], contents: dict[str, Content], folder: Pa
     Parameters
     ----------
     found : dict
-        The result of `report.collect`: machine, versions, settings, seconds.
+        The result of `report.collect_rows`: machine, versions, settings, seconds.
     contents : dict
         Each section's content, by name.
     folder : Path

@@ -20,7 +20,7 @@ from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import Sample, blocks, unblocked
 from lag_envs.scenes import PivotedBar
 from lag_envs.scenes.base import Scene
-from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.compiling import compile_lines, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -123,7 +123,6 @@ def _rate(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
     lines, values = rate_lines(equation)
     source = [
-        "def rate(t, y, p):",
         *(f"y{i} = y[{i}]" for i in range(equation.size)),
         *(f"p{i} = p[{i}]" for i in range(equation.parameters)),
         *lines,
@@ -131,7 +130,7 @@ def _rate(equation: Equation) -> Callable:
         *(f"out[{i}] = {value}" for i, value in enumerate(values)),
         "return out",
     ]
-    return compile_function("rate", "\n    ".join(source) + "\n")
+    return compile_lines("rate", "t, y, p", source)
 
 
 @cache
@@ -140,7 +139,6 @@ def _rate_of_many(equation: Equation) -> Callable:
     lines, values = rate_lines(equation)
     size = equation.size
     source = [
-        "def rate(t, y, p):",
         "out = np.empty(y.size)",
         "for j in range(p.shape[1]):",
         *(f"    y{i} = y[{size} * j + {i}]" for i in range(size)),
@@ -149,7 +147,7 @@ def _rate_of_many(equation: Equation) -> Callable:
         *(f"    out[{size} * j + {i}] = {value}" for i, value in enumerate(values)),
         "return out",
     ]
-    return compile_function("rate", "\n    ".join(source) + "\n")
+    return compile_lines("rate", "t, y, p", source)
 
 
 # --- heyoka ---

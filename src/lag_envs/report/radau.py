@@ -12,7 +12,7 @@ from lag_envs.report.integrators import RADAU
 from lag_envs.report.peers import rate_lines
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import Sample
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import compile_function, compile_lines
 
 A = np.array(RADAU)
 #: Relative size of the last correction, iterations at most, and the step of the Jacobian's differences.
@@ -90,11 +90,10 @@ def _loop(equation: Equation) -> Callable:
     """Compile ``radau(starts, p, ends, a, n, h)``: n steps from each state, one after the other."""
     lines, values = rate_lines(equation)
     source = [
-        "def rate(t, y, p, out):",
         *(f"y{i} = y[{i}]" for i in range(equation.size)),
         *(f"p{i} = p[{i}]" for i in range(equation.parameters)),
         *lines,
         *(f"out[{i}] = {value}" for i, value in enumerate(values)),
     ]
-    rate = compile_function("rate", "\n    ".join(source) + "\n")
+    rate = compile_lines("rate", "t, y, p, out", source)
     return compile_function("radau", SOURCE.lstrip(), rate, LAST=LAST, MOST=MOST, APART=APART)

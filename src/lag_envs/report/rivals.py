@@ -23,7 +23,7 @@ from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS
 from lag_envs.report.timing import BLOCK, FlowSteps, Sample, at_once, blocks, one_by_one, unblocked
 from lag_envs.scenes.base import Scene
-from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.compiling import compile_lines, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 
 
@@ -197,7 +197,6 @@ def _alone(equation: Equation, method: str, carried: bool) -> Callable:
     """Compile ``alone(y, p, changes, n, h)``: trajectories one after the other, n steps for each control."""
     y, p = _names(equation)
     lines = [
-        "def alone(y, p, changes, n, h):",
         "for j in range(y.shape[0]):",
         *(f"    {name} = y[j, {i}]" for i, name in enumerate(y)),
         "    for i in range(changes):",
@@ -208,7 +207,7 @@ def _alone(equation: Equation, method: str, carried: bool) -> Callable:
         *(f"            {line}" for line in _step(equation, method, carried)),
         *(f"    y[j, {i}] = {name}" for i, name in enumerate(y)),
     ]
-    return compile_function("alone", "\n    ".join(lines) + "\n")
+    return compile_lines("alone", "y, p, changes, n, h", lines)
 
 
 @cache
@@ -218,7 +217,6 @@ def _batch(equation: Equation, method: str, carried: bool) -> Callable:
     numbers = [*y, *p]
     at = {name: f"rows[base + np.uint64({BLOCK * j}) + i]" for j, name in enumerate(numbers)}
     lines = [
-        "def batch(rows, count, n, h):",
         "wide_vectors()",
         "for block in range(np.uint64(count)):",
         f"    base = block * np.uint64({BLOCK * len(numbers)})",
@@ -229,4 +227,4 @@ def _batch(equation: Equation, method: str, carried: bool) -> Callable:
         *(f"            {line}" for line in _step(equation, method, carried)),
         *(f"            {at[name]} = {name}" for name in y),
     ]
-    return compile_function("batch", "\n    ".join(lines) + "\n")
+    return compile_lines("batch", "rows, count, n, h", lines)

@@ -90,7 +90,7 @@ def run_jobs(
 
     Parameters
     ----------
-    jobs : sequence of Job
+    jobs : sequence of ReportJob
         Those that measure time run after the others, one by one.
     folder : Path
         Results are appended to ``results.jsonl`` in it; references are kept there too.
@@ -101,7 +101,7 @@ def run_jobs(
 
     Returns
     -------
-    results : list of Result
+    results : list of JobResult
         Of all finished jobs, in the order of the jobs.
     complete : bool
         False if the user interrupted it.

@@ -19,7 +19,7 @@ from lag_envs.report.cases import Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import motion_constants_of
-from lag_envs.stepping.compiling import BLOCK, compile_function
+from lag_envs.stepping.compiling import BLOCK, compile_lines
 from lag_envs.stepping.flows import Flow
 
 Array = NDArray[np.float64]
@@ -86,13 +86,12 @@ class FlowSteps:
         """``several(trajectories, controls, dt, x, constants...)``: one trajectory after the other."""
         extra = "".join(f", {name}" for name in self._code.constants)
         lines = [
-            f"def several(trajectories, controls, dt, x{extra}):",
             "refused = 0",
             "for j in range(controls.shape[0]):",
             f"    refused += simulate(trajectories[j], controls[j], dt, x{extra})",
             "return refused",
         ]
-        return compile_function("several", "\n    ".join(lines) + "\n", self.simulate)
+        return compile_lines("several", f"trajectories, controls, dt, x{extra}", lines, self.simulate)
 
     @cached_property
     def batch(self) -> Callable:
@@ -126,7 +125,6 @@ class FlowSteps:
             *(f"            {at(y)} = {y}" for y in code.start),
         ]
         lines = [
-            f"def batch(rows, count, steps, dt, x{''.join(f', {name}' for name in code.constants)}):",
             "wide_vectors()",
             "refused = 0",
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
@@ -137,8 +135,9 @@ class FlowSteps:
             *(() if self.plain else (f"        {line}" for line in redo)),
             "return refused",
         ]
-        source = "\n    ".join(lines).replace("lanes", f"range(np.uint64({BLOCK}))") + "\n"
-        return compile_function("batch", source, *(() if self.plain else (code.compile(),)))
+        lines = [line.replace("lanes", f"range(np.uint64({BLOCK}))") for line in lines]
+        arguments = ", ".join(["rows, count, steps, dt, x", *code.constants])
+        return compile_lines("batch", arguments, lines, *(() if self.plain else (code.compile(),)))
 
     def fill(self, cases: Sequence[Case]) -> Array:
         """Return the rows of a batch."""
@@ -197,7 +196,7 @@ def one_by_one(kernels: FlowSteps, cases: Sequence[Case], controls: Array, dt: f
 
     Parameters
     ----------
-    kernels : Kernels
+    kernels : FlowSteps
         The compiled steps.
     cases : sequence of Case
         Starts, all on the same scene.

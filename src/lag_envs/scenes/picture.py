@@ -229,7 +229,7 @@ def places(scene: Scene, now: Frame) -> dict[str, Any]:
     rests = scene.rests()
     q: dict[str, Any] = dict.fromkeys(layout.names, 0.0)
     for name, level, by in layout.prescribed:
-        q[name] = {"rest": rests.get(name, 0.0), "place": controls.get(by or "", 0.0)}.get(level, 0.0)
+        q[name] = {"rest": rests.get(name, 0.0), "place": controls.get(by, 0.0)}.get(level, 0.0)
     places = {entry.coordinate: now.state[i] for i, entry in enumerate(layout.state) if entry.kind == "place"}
     return q | turned | places
 

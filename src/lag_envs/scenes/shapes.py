@@ -118,7 +118,7 @@ class Frame(NamedTuple):
     target : float, sequence of float or None
         The episode's targets.
     turned : float or sequence of float
-        The places that the state leaves out; see `picture.turning`.
+        The places that the state leaves out; see `picture.left_out_rates`.
     """
 
     state: Sequence[Any]

@@ -1,17 +1,14 @@
-"""Numerics: how one control step is taken.
+"""Numerics: how one control step is taken, and derived.
 
-``tracing``
-    Runs a plain formula once on recording numbers.
-``primitives``
-    Turns a record into compiled code; also holds the counter-based random generator.
-``elementary``
-    Sine, exponential and similar functions from plain arithmetic: the same bits on every machine.
-``compiling``
-    Compiles functions that call such blocks, and keeps the results on disk.
-``pendulum``
-    The driven, damped pendulum (bar, cylinder in shell): Taylor series with a proved bound.
-``slope``
-    The rolling cylinder on a slope: closed form (fixed slope), linear flow (moving slope).
-``flows``
-    Builds a scene's control step from one of these.
+Recording
+    ``tracing`` runs a formula once on numbers that record, ``elementary`` gives them sine, exponential and
+    so on, ``adjoint`` differentiates a recording.
+The general series
+    ``lowering`` turns equations into a record of series, ``series`` writes their step once, with the
+    ``certificate``; ``machine`` and ``script`` print it, ``driver`` divides a control step, ``backward``
+    differentiates it, ``general`` puts a scene's step together, ``lag`` with a motor's lag.
+Flows of their own
+    ``normal_forms`` recognises them, ``pendulum`` and ``slope`` step them, ``flows`` makes a scene's step.
+Machine code
+    ``compiling`` and ``cache``; ``primitives`` prints recorded operations.
 """

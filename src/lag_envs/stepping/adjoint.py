@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.compiling import compile_lines, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import BOOLEAN, Operation, Trace, TracedNumber
 
@@ -52,7 +52,7 @@ class Differentiable(Trace):
             The numbers to differentiate.
         seeds : sequence of number
             One for each output, its cotangent.
-        inputs : sequence of Number
+        inputs : sequence of TracedNumber
             The numbers to differentiate with respect to. Results of earlier operations count as independent
             inputs: nothing is passed on to what they were computed from.
         """
@@ -180,7 +180,6 @@ class LaneFormula:
         work += [f"{at} = {value}" for at, value in zip(out, values, strict=True)]
         arrays = [f"given{i}" for i in range(len(inputs))], [f"found{i}" for i in range(len(found))]
         body = [
-            f"def {name}({', '.join([*arrays[0], *arrays[1], 'numbers'])}):",
             "wide_vectors()",
             f"rows, count = np.empty({len(row) * LANES}), np.uint64(found0.shape[0])",
             *(f"{constant} = numbers[{j}]" for j, constant in enumerate(constants)),
@@ -192,7 +191,7 @@ class LaneFormula:
             *(f"        {line}" for line in work or ["pass"]),  # a step without controls has none to compute
             *_loops(zip(places, out, strict=True)),
         ]
-        self._compiled: Any = compile_function(name, "\n    ".join(body) + "\n")
+        self._compiled: Any = compile_lines(name, ", ".join([*arrays[0], *arrays[1], "numbers"]), body)
         self._sizes = [len(numbers) for numbers in found]
         self._kinds: dict[tuple[str, ...], Callable] = {}
 

@@ -102,7 +102,7 @@ class Backward(Series):
 
         Returns
         -------
-        lane : Lane
+        lane : StepProgress
             The lane after the substep.
         bars : list of number
             Cotangents before the substep in lanes that went backwards, with those of the sources added up;
@@ -154,9 +154,9 @@ class Backward(Series):
     def _back(
         self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence
     ) -> tuple[list, list]:
-        """Return cotangents before the step just expanded from those after it, see `pull`.
+        """Return what the cotangents leave out, estimated as in `following`, and the cotangents.
 
-        Before them stands an estimate of what the cotangents leave out, see `following`.
+        They are those before the step just expanded, from those after it; see `pull`.
         """
         both: Any = PairTarget(t, self.slots, self._bar_slots)
         found = self._sweep(both, start, h, order, ends)

@@ -118,6 +118,19 @@ def absent_from(*constants: Mapping[str, float]) -> frozenset[str]:
     return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
+def indent(lines: Iterable[str]) -> list[str]:
+    """Indent lines of code."""
+    return ["    " + line for line in lines]
+
+
+def compile_lines(
+    name: str, arguments: str, body: Iterable[str], *helpers: Callable, inner: bool = False
+) -> Callable:
+    """Compile a function of these lines under a name; otherwise like `compile_function`."""
+    source = "\n".join([f"def {name}({arguments}):", *indent(body), ""])
+    return compile_function(name, source, *helpers, inner=inner)
+
+
 def compile_python(
     name: str,
     function: Callable,
@@ -151,5 +164,5 @@ def compile_traced(
     outputs = formula(trace, *(trace.zero() if n in absent else trace.inputs(n)[0] for n in names))
     names = [f"out{i}" for i in range(len(outputs))]
     lines, values = record_block(trace, dict(zip(names, outputs, strict=True)))
-    body = [f"def {name}({arguments}):", *lines, f"return {', '.join(map(str, values))}"]
-    return compile_function(name, "\n    ".join(body) + "\n")
+    body = [*lines, f"return {', '.join(map(str, values))}"]
+    return compile_lines(name, arguments, body)

@@ -198,7 +198,7 @@ def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-u
         sizes[i] = 0.0
     while rows[left] > 0.0:
         before = rows[left]
-        # What is longer by little only would leave a rest too short to be stepped.
+        # Without the margin, a rounding could leave a remainder too short to be stepped.
         if rows[wish] > 1.001 * longest:
             rows[wish] = longest
         attempt(rows, 0, order, tolerance)

@@ -18,7 +18,7 @@ import numpy as np
 
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
-from lag_envs.stepping.compiling import compile_function, count_operations, record_block
+from lag_envs.stepping.compiling import compile_lines, count_operations, indent, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.tracing import Trace
 
@@ -253,8 +253,8 @@ class Stepper:
 
         It takes any step. The status is the number of substeps, or negative if the step is refused.
         """
-        body = [f"def advance({self.arguments}):", *self.any_step, f"return {', '.join(self.end)}, status"]
-        return compile_function("advance", "\n    ".join(body) + "\n", self.engine())
+        body = [*self.any_step, f"return {', '.join(self.end)}, status"]
+        return compile_lines("advance", self.arguments, body, self.engine())
 
     @cache  # noqa: B019 - steppers are kept anyway
     def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...] = ()) -> Callable:
@@ -308,14 +308,14 @@ class Stepper:
             *(f"out[i, {j // wide}, {j % wide}] = {x}" for j, x in enumerate(after)),
         ]
         body = [
-            f"def jacobian({', '.join(['states, controls, out, dt, x', *self.constants])}):",
             f"values, slopes = np.empty({rows}), np.empty(({rows}, {wide}))",
             f"scratch = np.empty((4, {max(rows, wide)}))",
             "for i in range(states.shape[0]):",
-            *("    " + line for line in loop),
+            *indent(loop),
             "return 0",
         ]
-        return compile_function("jacobian", "\n    ".join(body) + "\n", self._tangent(by))
+        arguments = ", ".join(["states, controls, out, dt, x", *self.constants])
+        return compile_lines("jacobian", arguments, body, self._tangent(by))
 
     def pull(
         self,
@@ -396,12 +396,11 @@ class Stepper:
             *(f"{y} = {z}" for y, z in zip(self.start, self.end, strict=True)),
             *(f"trajectory[i + 1, {i}] = y{i}" for i in range(n)),
         ]
-        extra = "".join(f", {name}" for name in self.constants)
+        arguments = ", ".join(["trajectory, controls, dt, x", *self.constants])
         body = [
-            f"def simulate(trajectory, controls, dt, x{extra}):",
             *load,
             "for i in range(controls.shape[0]):",
-            *("    " + line for line in loop),
+            *indent(loop),
             "return 0",
         ]
-        return compile_function("simulate", "\n    ".join(body) + "\n", self.engine())
+        return compile_lines("simulate", arguments, body, self.engine())

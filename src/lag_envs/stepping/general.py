@@ -21,7 +21,7 @@ from lag_envs.mechanics.evaluation import eliminated, exactly
 from lag_envs.mechanics.layout import Prescribed
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter, parameter_values
-from lag_envs.stepping.compiling import absent_from, block_lines, compile_function
+from lag_envs.stepping.compiling import absent_from, block_lines, compile_lines, indent
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
@@ -62,7 +62,7 @@ class SeriesStepper:
         moving: dict[str, list[Expr]] = {}
         for p in self._layout.at("acceleration", "rate"):
             s = Expr.of(Atom("start", p.name))
-            held = Expr.of(control(p.control or ""))
+            held = Expr.of(control(p.control))
             if p.level == "rate":
                 moving[p.name] = [s + elapsed * held, held]
             else:
@@ -180,7 +180,7 @@ class SeriesStepper:
 
     def _by(self, p: Prescribed, numbers: Sequence) -> Any:
         """Return the number for the control of a prescribed coordinate, from the numbers for all controls."""
-        return numbers[self._layout.controls.index(p.control or "")]
+        return numbers[self._layout.controls.index(p.control)]
 
     # --- derivatives ---------------------------------------------------------------------------------------
 
@@ -301,11 +301,8 @@ class SeriesTangent:
         numbers = [self._numbers.get(f"p_{name}", 0.0) for name in self._by]
         y, u, p = variables_of(states, controls, np.broadcast_to(numbers, (count, len(numbers))))
         moved = {f"parameter_{name}": number for name, number in zip(self._by, p, strict=True)}
-        k: dict[str, Any] = {**self._numbers} | {
-            name: moved[f"parameter_{name.removeprefix('p_')}"]
-            for name in self._numbers
-            if name.removeprefix("p_") in self._by
-        }
+        changed = {f"p_{name}": number for name, number in zip(self._by, p, strict=True)}
+        k: dict[str, Any] = {name: changed.get(name, x) for name, x in self._numbers.items()}
         before = self._stepper.prepare(xp, y, u, k) | moved
         values = np.empty((count, first + 2 * size))
         values[:, :first] = self._constants
@@ -357,7 +354,8 @@ class SeriesTangent:
             shorter, pulled = longest[some], found if every else np.empty((self._width, len(some)))
             parts = (given, seeds) if every else (given[:, some].copy(), seeds[:, some].copy())
             if refused := self._pull(*parts, pulled, shorter, *linear, dt, further):
-                # Substeps backwards are no longer than the shortest of the step. Forwards they grow again.
+                # In reverse mode no substep is longer than the shortest, so there may be too many. In forward
+                # mode substeps grow again.
                 i = some[refused - 1 : refused]
                 slopes, refused = self.jacobian(states[i], controls[i], dt, order)
                 if refused:
@@ -530,8 +528,8 @@ class StepCode:
         bounds on places and velocities are left at the end of `rows`, which has `scratch` numbers.
         """
         results = ", ".join([*self.end, *self.applied, "status"])
-        body = [f"def advance({self.arguments}):", *self.any_step, f"return {results}"]
-        return compile_function("advance", "\n    ".join(body) + "\n", self.engine(tolerance))
+        body = [*self.any_step, f"return {results}"]
+        return compile_lines("advance", self.arguments, body, self.engine(tolerance))
 
     @property
     def any_step(self) -> list[str]:
@@ -588,7 +586,7 @@ class StepCode:
         It fills the trajectory's rows from the second on, and returns the row whose step was refused, or 0.
         A row is the state, followed by the lagged controls; `controls` holds the commands of each step.
         """
-        extra = "".join(f", {name}" for name in self.constants)
+        arguments = ", ".join(["trajectory, controls, dt, order", *self.constants])
         reached = [name.removesuffix("_end") for name in self.applied if name.endswith("_end")]
         carried = [*self.start, *reached]
         given = [name for name in self.controls if name not in reached]
@@ -604,14 +602,13 @@ class StepCode:
             ),
         ]
         body = [
-            f"def simulate(trajectory, controls, dt, order{extra}):",
             f"rows = np.zeros({self.scratch})",
             *(f"{y} = trajectory[0, {i}]" for i, y in enumerate(carried)),
             "for i in range(controls.shape[0]):",
-            *("    " + line for line in loop),
+            *indent(loop),
             "return 0",
         ]
-        return compile_function("simulate", "\n    ".join(body) + "\n", self.engine(tolerance))
+        return compile_lines("simulate", arguments, body, self.engine(tolerance))
 
 
 _steppers: dict[tuple[type[SeriesStepper], str], SeriesStepper] = {}

@@ -44,10 +44,10 @@ class LaggedStepper(SeriesStepper):
     def _lowered(self, tangents: Sequence[str] | None = None) -> tuple[Lowering, tuple[list[int], dict]]:
         layout, m = self._layout, self.mechanics
         rates = {name: -Expr.of(Atom("decay", name)) for name in layout.controls}
-        rates |= {p.name: rates[p.control or ""] for p in layout.at("acceleration", "rate")}
+        rates |= {p.name: rates[p.control] for p in layout.at("acceleration", "rate")}
         lowering = Lowering(layout.free, self._moving(), tangents, rates)
         force = list(m.force)
-        of = {p.name: p.control or "" for p in layout.prescribed}
+        of = {p.name: p.control for p in layout.prescribed}
         for (i, name), entry in sorted(m.coupling.items()):  # a changing rate exerts a force
             force[i] = force[i] - entry * Expr.of(velocity(of[name]))
         return lowering, lowering.parts(m.mass, force)
@@ -61,7 +61,7 @@ class LaggedStepper(SeriesStepper):
             fade = Expr.of(Atom(FADING[0], name))
             moving[name] = [Expr.of(Atom("command", name)) + gap * fade, -decay * gap * fade]
         for p in self._layout.at("acceleration", "rate"):
-            s, by = Expr.of(Atom("start", p.name)), p.control or ""
+            s, by = Expr.of(Atom("start", p.name)), p.control
             command, gap = (Expr.of(Atom(kind, by)) for kind in ("command", "gap"))
             once, twice = (Expr.of(Atom(kind, by)) for kind in FADING[1:])
             u, u_dot = moving[by]

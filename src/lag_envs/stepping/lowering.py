@@ -286,7 +286,7 @@ class Lowering:
         return self._known[key] + (atom.function == "cos")
 
     def _rate(self, argument: Expr) -> tuple[int, ...]:
-        """Return the node of an argument's rate if it is a weighted sum of places, else None."""
+        """Return the node of an argument's rate if it is a weighted sum of places, else ()."""
         total = Expr({})
         for monomial, c in argument.terms.items():
             varying = [(atom, n) for atom, n in monomial if self._varies(atom)]

@@ -9,7 +9,7 @@ from lag_envs.stepping.target import Target
 
 
 class Inverse:
-    """The inverse of a symmetric matrix by symmetric sweeps. Entries that are not there cost nothing.
+    """The inverse of a symmetric matrix by symmetric sweeps.
 
     Attributes
     ----------

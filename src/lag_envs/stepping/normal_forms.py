@@ -53,7 +53,7 @@ class NormalForm:
     ----------
     kind : type
         The flow's coefficients.
-    layout : Layout
+    layout : SceneLayout
         Names of coordinates, controls and state.
     terms : mapping
         For each coefficient its terms.
@@ -109,8 +109,7 @@ class NormalForm:
 
     def lift(self, state: ArrayLike) -> tuple:
         """Return the state's entries, each of shape (...), followed by cosine and sine of the angle."""
-        y = tuple(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0))
-        return y if self.angle is None else (*y, np.cos(y[self.angle]), np.sin(y[self.angle]))
+        return tuple(lifted(self, np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), np))
 
     def drive(self, y: Sequence, u: Sequence, k: Any, xp: Any) -> Any:
         """Return the flow's coefficients under held controls, from lifted state and constants."""
@@ -153,9 +152,9 @@ class NormalForm:
             elif by is None:
                 after.append(moved[1] + (self._carried(u, k) if entry.kind == "momentum" else 0.0))
             elif entry.kind == "velocity" or by.level == "rate":
-                after.append(given[entry.name] + dt * given[by.control or ""])
+                after.append(given[entry.name] + dt * given[by.control])
             else:
-                rate, push = given[f"{by.name}_dot"], given[by.control or ""]
+                rate, push = given[f"{by.name}_dot"], given[by.control]
                 after.append(given[by.name] + dt * (rate + 0.5 * dt * push))
         return [*after, *moved[2:]]
 
@@ -351,7 +350,7 @@ class TurningSlopeForm(NormalForm):
         return TURN
 
     def _held(self, u: Sequence) -> Mapping[str, Any]:
-        return {"rate": u[self.layout.controls.index(self.layout.at("rate")[0].control or "")]}
+        return {"rate": u[self.layout.controls.index(self.layout.at("rate")[0].control)]}
 
     def _carried(self, u: Sequence, k: Any) -> Any:
         return k.shift * self._held(u)["rate"]
@@ -415,7 +414,7 @@ def _recognised(m: Mechanics) -> NormalForm | None:
             if held != Expr.of(1).text:
                 return None  # a product of a control and a changing rate
             delta[Expr.of(velocity(p.name)).text] = Expr.of(velocity(p.name)), constant[1]
-            ramp[Expr.of(control(p.control or "")).text] = Expr.of(control(p.control or "")), constant[1]
+            ramp[Expr.of(control(p.control)).text] = Expr.of(control(p.control)), constant[1]
     terms = {name: _negative(parts.get(name, {})) for name in ("alpha", "beta", "gamma")}
     return _form(m, DrivenPendulum, terms | {"delta": delta, "ramp": ramp})
 
@@ -472,7 +471,7 @@ def _unheld(part: _Parts) -> _Parts:
 def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
     """Return the turning slope's form, for a scene that holds the rate of one coordinate."""
     (rate, *others), one = m.layout.at("rate"), Expr.of(1).text
-    held = Expr.of(control(rate.control or ""))
+    held = Expr.of(control(rate.control))
     wanted = {"gravity": one, "centrifugal": (held * held).text, "gamma": one}
     if (
         others

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 
 class Pair(NamedTuple):
-    """A cotangent, and what its terms tell of those that are left out, see `following`."""
+    """A cotangent, and an estimate of the terms that its series leaves out, see `following`."""
 
     whole: Any
     last: Any

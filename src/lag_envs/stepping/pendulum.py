@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.stepping.compiling import compile_function, compile_python, compile_traced, record_block
+from lag_envs.stepping.compiling import compile_lines, compile_python, compile_traced, record_block
 from lag_envs.stepping.dual import Variable
 from lag_envs.stepping.tracing import Trace, pairwise_sum, polynomial, sum_of_products
 from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
@@ -689,7 +689,6 @@ def compile_tangent(absent: frozenset[str], by: tuple[str, ...], order: int = OR
     found = step_slopes(omega, c, s, Coefficients(*rest), h, elapsed, columns, order)
     lines, entries = record_block(trace, {f"out{i}": x for i, x in enumerate(found)})
     body = [
-        f"def local(change, {', '.join(numbers)}):",
         *lines,
         *(f"change[{i // n}, {i % n}] = {x}" for i, x in enumerate(entries)),
     ]
@@ -699,7 +698,7 @@ def compile_tangent(absent: frozenset[str], by: tuple[str, ...], order: int = OR
         "tangent",
         _tangent,
         holds,
-        compile_function("local", "\n    ".join(body) + "\n"),
+        compile_lines("local", f"change, {', '.join(numbers)}", body),
         compile_python("carry", _carry, ROWS=rows),
         _compile_plan(),
         _compile_slow_motion(_slow_slopes),

@@ -29,7 +29,8 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
 _M2 = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S11 = (np.uint64(n) for n in (30, 27, 31, 11))
-_DRAWS = np.uint64(16)  # draws reserved for each step
+#: Random numbers reserved for each step.
+DRAWS = np.uint64(16)
 _ONE = np.uint64(1)
 
 
@@ -49,7 +50,7 @@ def episode_key(key, episode):  # type: ignore[no-untyped-def]
 @njit(forceinline=True)
 def uniform(key, step, index):  # type: ignore[no-untyped-def]
     """Return draw ``index`` (below 16) of step ``step`` of the episode with this key, in [0, 1)."""
-    z = _mix(key + (step * _DRAWS + index + _ONE) * GOLDEN)
+    z = _mix(key + (step * DRAWS + index + _ONE) * GOLDEN)
     return np.float64(np.int64(z >> _S11)) * 2.0**-53
 
 

@@ -558,7 +558,7 @@ class Series:
             if name.startswith("decay_"):
                 gap = inputs[f"gap_{name.removeprefix('decay_')}"]
                 reach = t.add(inputs[ELAPSED], t.div(t.number(REACH), inputs[name]))
-                # What is longer by a rounding only would leave a rest too short to be stepped.
+                # Without the margin, a rounding could leave a remainder too short to be stepped.
                 over = t.less(t.mul(t.number(1.001), reach), h)
                 shorter = t.both(over, t.less(t.number(0.0), t.abs(gap)))
                 h = t.select(shorter, reach, h)
@@ -571,7 +571,7 @@ class Series:
 
         Returns
         -------
-        lane : Lane
+        lane : StepProgress
             What it is afterwards; as before where nothing was left or certified.
         bounds : list of number
             Bounds on what places and velocities leave out.
@@ -606,7 +606,7 @@ class Series:
         done = t.both(done, wanted)
         used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
-        # What is nearly a step more is taken as one.
+        # The next is twice as long, or takes all that is left if that is less than three times this one.
         longer = t.select(t.less(left, t.mul(t.number(3.0), used)), left, t.add(used, used))
         after = StepProgress(
             [t.select(done, x, before) for x, before in zip(q, lane.q, strict=True)],

@@ -55,6 +55,7 @@ class Acting:
     """How a control follows from an action: ``low + (high - low)(a + 1)/2``, or one of `values`."""
 
     control: str
+    unit: str
     low: float
     high: float
     values: tuple[float, ...] = ()
@@ -617,8 +618,8 @@ def _mapping(task: Task, name: str) -> dict[str, Any]:
 
 
 def _acting(task: Task) -> list[Acting]:
-    of, known = type(task).__name__, task.scene.control_names
-    found = []
+    of, found = type(task).__name__, []
+    known = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     for name, given in _mapping(task, "action").items():
         where = f"{of}.action[{name!r}]"
         if name not in known:
@@ -627,15 +628,15 @@ def _acting(task: Task) -> list[Acting]:
             values = _numbers_of(where, given)
             if len(values) < 2:
                 raise FormulaError(f"{where} must list at least two values, got {given!r}")
-            found.append(Acting(name, min(values), max(values), values))
+            found.append(Acting(name, known[name], min(values), max(values), values))
             continue
         pair = _numbers_of(where, given if isinstance(given, tuple) else (given,))
         pair = pair if isinstance(given, tuple) else (-pair[0], pair[0])
         if len(pair) != 2 or not pair[0] < pair[1]:
             raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
-        found.append(Acting(name, *pair))
+        found.append(Acting(name, known[name], *pair))
     if known and not found:
-        raise FormulaError(f"{of}.action must give limits of controls, as in {{{known[0]!r}: 1.0}}")
+        raise FormulaError(f"{of}.action must give limits of controls, as in {{{next(iter(known))!r}: 1.0}}")
     return found
 
 

@@ -24,7 +24,7 @@ class Actuators:
     ----------
     options : Imperfections
         The imperfections of the actuators.
-    formulas : Formulas
+    formulas : TaskFormulas
         The task's formulas.
     a, y, u : sequence of str
         Actions, state and controls.

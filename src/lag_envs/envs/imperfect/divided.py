@@ -12,7 +12,8 @@ from typing import Any
 
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.whole import WholeProgram
-from lag_envs.envs.lines import EACH_LANE, indent, indented
+from lag_envs.envs.lines import EACH_LANE, indented
+from lag_envs.stepping.compiling import indent
 
 
 class DividedProgram(WholeProgram):

@@ -7,7 +7,7 @@ from typing import Any
 
 from lag_envs.envs.imperfect.draws import noise, purpose_key
 from lag_envs.envs.imperfect.rows import Ring, RowsWithRings
-from lag_envs.envs.lines import indent
+from lag_envs.stepping.compiling import indent
 from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks.imperfections import Imperfections
 

@@ -9,8 +9,8 @@ from lag_envs.envs.imperfect.drawn import DrawnProgram
 from lag_envs.envs.imperfect.lagged import LaggedCode
 from lag_envs.envs.imperfect.rows import RowsWithRings
 from lag_envs.envs.imperfect.sensors import Sensors
-from lag_envs.envs.lines import EACH_LANE, indent, indented
-from lag_envs.stepping.compiling import BLOCK
+from lag_envs.envs.lines import EACH_LANE, indented
+from lag_envs.stepping.compiling import BLOCK, indent
 from lag_envs.stepping.rows import Rows
 from lag_envs.tasks.base import Task
 

@@ -185,7 +185,8 @@ def render(
                 row["file"] = keep_data(f"{board['page']}-{i}", episodes)
                 if row["name"] == board["shown"] and not board["film"]:
                     board["film"] = keep_data(f"{board['page']}-film", episodes[:1])
-        preview = scenery.preview(board.pop("states"), board.pop("goal_of_states")) if url else None
+        states, target = board.pop("states"), board.pop("goal_of_states")
+        preview = scenery.preview(states, target) if url else None
         board["preview"] = preview and keep(board["page"], "png", preview)
         boards.append(board)
 
@@ -278,8 +279,8 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     board["page"] = _slug(str(given["id"]))
     if board["protocol"] != protocol:
         board["page"] += f"-protocol-{re.sub('[^0-9]+', '-', str(board['protocol']))}"
-    known, board["optimum"] = board["known"], None
-    if known and known.get("optimum") is not None and known["best"] != known["random"]:
+    board["optimum"] = None
+    if known.get("optimum") is not None and known["best"] != known["random"]:
         board["optimum"] = (known["optimum"] - known["random"]) / (known["best"] - known["random"])
     # From the best agent that can be watched; without any, the scene at its start.
     watched = [row for row in board["rows"] if row["replays"]]

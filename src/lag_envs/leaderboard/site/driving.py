@@ -76,7 +76,6 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
     """Return the page's data about a step, in JSON types."""
     task, program = env.task, env.program
     formulas, rows = task.formulas, env.program.rows
-    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     resting = formulas.rest_action
     form = form_of(task.scene)
     return {
@@ -100,7 +99,7 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
         "controls": [
             {
                 "name": a.control,
-                "unit": units[a.control],
+                "unit": a.unit,
                 "meaning": task.quantities.get(a.control, ("", None))[1],
                 "low": a.low,
                 "high": a.high,
@@ -149,8 +148,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     if task.formulas.clipped and acting and all(a.low == -a.high for a in acting):
         limit = {"name": "control limit", "at": names.index("strength"), "value": 1.0}
         if len(acting) == 1:
-            place = task.scene.control_names.index(acting[0].control)
-            found.append(limit | {"shown": acting[0].high, "unit": task.scene.control_units[place]})
+            found.append(limit | {"shown": acting[0].high, "unit": acting[0].unit})
         else:
             found.append(limit | {"shown": 100.0, "unit": "%"})
     return found
@@ -209,7 +207,7 @@ def agent(policy: SubmittedPolicy) -> dict[str, Any] | None:
 
     Parameters
     ----------
-    policy : Policy
+    policy : SubmittedPolicy
         The policy.
     """
     made = policy.architecture
