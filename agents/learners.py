@@ -41,7 +41,7 @@ from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
 from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
-from lag_envs.leaderboard.export import LOADING
+from lag_envs.leaderboard import export
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.scores import known_returns, score
@@ -50,13 +50,7 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.registration import make_task
 
 #: The place of each learner's class.
-ALGORITHMS = {
-    "ppo": ("stable_baselines3", "PPO"),
-    "sac": ("stable_baselines3", "SAC"),
-    "td3": ("stable_baselines3", "TD3"),
-    "dqn": ("stable_baselines3", "DQN"),
-    "tqc": ("sb3_contrib", "TQC"),
-}
+ALGORITHMS = {name: place[:2] for name, place in export.ALGORITHMS.items() if name != "a2c"}
 #: Learners of our own: the module that trains each, and its name in tables.
 OWN = {
     "fast_ppo": ("agents.ppo", "fast PPO"),
@@ -312,7 +306,7 @@ def thaw(run: Run, content: Mapping[str, Any]) -> Any:
         envs = make_envs(run, normalise)
         log = str(run.path("tensorboard"))
         model = learner(run.algo).load(
-            io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log, **LOADING
+            io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log, **export.LOADING
         )
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
@@ -455,7 +449,7 @@ def finish_training(run: Run, best: Mapping[str, Any]) -> None:
     normalise = pickle.loads(best["normalisation"])
     if normalise is not None and normalise.norm_obs:
         write_file(run.path(NORMALISATION), best["normalisation"])
-    model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu", **LOADING)
+    model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu", **export.LOADING)
     evaluate_finished(run, policy_of(run.settings, model, normalise), best["trained"])
 
 
@@ -505,7 +499,7 @@ def load_policy(folder: Path) -> Any:
     try:
         if result["algo"] in OWN:
             return import_module(OWN[result["algo"]][0]).Policy.load(folder / MODEL)
-        model = learner(result["algo"]).load(folder / MODEL, device="cpu", **LOADING)
+        model = learner(result["algo"]).load(folder / MODEL, device="cpu", **export.LOADING)
         file = folder / NORMALISATION
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None
     except Exception as error:  # whatever a damaged file leads to

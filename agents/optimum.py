@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -19,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds
+from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.value_iteration import (
-    CacheError,
     DynamicProgramme,
     Grid,
     Kick,
@@ -36,6 +34,7 @@ from lag_envs.evaluation import statistics
 from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.host import machine
 from lag_envs.mechanics.recording import parameter_values
+from lag_envs.options import module_parser
 from lag_envs.store import write_file
 from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task
@@ -538,12 +537,7 @@ def draw_values(env_id: str, folder: Path, file: Path, level: float) -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = argparse.ArgumentParser(
-        prog="python -m agents.optimum",
-        description="Compute the best return that is possible, for every task.",
-        epilog=HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    p = module_parser("agents.optimum", "Compute the best return that is possible, for every task.", HELP)
     p.add_argument("env", nargs="*", metavar="ENV", help="ids of environments (default: all)")
     p.add_argument("--quick", action="store_true", help="coarse grids; everything is written to FOLDER")
     p.add_argument(
@@ -556,30 +550,21 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.optimum")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 for a mistake of the user's, 128 + signal when interrupted."""
+    """Run the command; return 0, 2 for a mistake of the user's, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    # Tasks that serve as relaxations of others are solved first.
+    known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
+    last = {env_id for env_id, problem in known.items() if problem and problem.relaxed}
+    ids = [check_env(name) for name in args.env] or sorted(TASKS, key=last.__contains__)
     try:
-        # Tasks that serve as relaxations of others are solved first.
-        known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
-        last = {env_id for env_id, problem in known.items() if problem and problem.relaxed}
-        ids = [check_env(name) for name in args.env] or sorted(TASKS, key=last.__contains__)
         for env_id in dict.fromkeys(ids):
             compute_optimum(env_id, args)
-    except (UserError, CacheError, OSError) as error:
-        print(f"agents.optimum: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as error:
+    except KeyboardInterrupt:
         print("\nInterrupted; re-run it (without --new) to resume.", file=sys.stderr)
-        return 128 + (error.args[0] if error.args else signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        return 130
     return 0
-
-
-def _interrupt(number: int, frame: Any) -> None:
-    raise KeyboardInterrupt(number)
 
 
 def compute_optimum(env_id: str, args: argparse.Namespace) -> None:

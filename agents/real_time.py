@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from agents.report import stored
 from agents.results import ROOT, write_envs
-from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds, reports_errors
+from agents.run import FIRST_FRESH_SEED, check_env, check_numbers, fresh_seeds, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import ILQR, build
 from lag_envs.evaluation.rollout import play
@@ -128,9 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="results as JSON (default agents/results/real_time.json)",
     )
     args = p.parse_args(arguments)
-    for name, least in (("clocked", 1), ("episodes", 2)):
-        if getattr(args, name) < least:
-            raise UserError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    check_numbers(args, clocked=1, episodes=2)
     envs = [check_env(name) for name in args.env] or list(TASKS)
     found = stored(args.output).get("envs", {}) if args.env else {}
     about = {"date": datetime.date.today().isoformat(), "machine": machine(), "clocked": args.clocked}

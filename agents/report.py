@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lag_envs.benchmark.results import quartiles
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
-from lag_envs.tables import markdown_table, rate_text
+from lag_envs.tables import markdown_table, mean_with_error, rate_text
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured_entry
 
@@ -24,6 +25,7 @@ OPTIMA = Path(__file__).with_name("results") / "optimum"
 BEHAVIOUR = Path(__file__).with_name("results") / "behaviour.json"
 REAL_TIME = Path(__file__).with_name("results") / "real_time.json"
 DOCS = Path(__file__).parents[1] / "docs"
+plus_minus = partial(mean_with_error, most=4, exact=2)
 
 # --- the page -----------------------------------------------------------------------------------------------
 
@@ -482,15 +484,3 @@ def with_interval(found: Mapping[str, float]) -> str:
         return meaningful_digits(found["value"])
     value, low, high = (meaningful_digits(found[name]) for name in ("value", "low", "high"))
     return f"{value} ({low}, {high})"
-
-
-def plus_minus(mean: float, error: float) -> str:
-    """Return a mean with its standard error, to the error's second digit.
-
-    Examples
-    --------
-    >>> plus_minus(417.923, 0.0312), plus_minus(-4.0, 0.0)
-    ('417.923 ± 0.031', '-4.00 ± 0.00')
-    """
-    digits = 2 if error <= 0.0 else min(4, max(0, 1 - math.floor(math.log10(error))))
-    return f"{mean:.{digits}f} ± {error:.{digits}f}"

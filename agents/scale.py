@@ -5,9 +5,9 @@ controllers that plan or were measured before, and the board's reference, and pr
 beside the numbers in use. A slow policy plays only the first episodes, and its luck is corrected by the
 reference's returns in these and in all episodes (a control variate). The reference's own number comes from
 other, independent episodes. ``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use
-stay, and an environment without any gets new ones. Its best known policy is then the best of its controllers
-and of the trained learners, each of which plays with the seed that ended best. Where that run is missing, the
-policy that ships with the package is played.
+stay, and an environment without any gets new ones. Its best known policy is then the best among its
+controllers and learners. A learner plays with its best seed; where that run is missing, the policy that ships
+with the package is played.
 """
 
 from __future__ import annotations
@@ -149,20 +149,21 @@ def measure_environment(
         tail = "" if used is None else f"   in use: {used}"
         print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}{tail}", flush=True)
 
+    def show_mean(name: str, returns: Array, used: float | None = None) -> None:
+        show(name, *mean_and_error(returns), len(returns), used)
+
     best = shipped().get(env_id)  # played where runs are missing
     in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
     for name in dict.fromkeys(names):
         if name not in {*known, *learners, "optimal"}:
             if best and name == best.name:
-                returns = fast_returns(env_id, load(env_id), batches, size)
-                show(name, *mean_and_error(returns), len(returns), in_use.get(name))
+                show_mean(name, fast_returns(env_id, load(env_id), batches, size), in_use.get(name))
                 continue
             print(f"{env_id:28} {name:20} is not in {runs}; its earlier measurements stay", flush=True)
             found[name] = kept["measured"][name]
         elif name not in slow:
             agent = learners[name].make() if name in learners else make_controller(env_id, name)
-            returns = fast_returns(env_id, agent, batches, size)
-            show(name, *mean_and_error(returns), len(returns), in_use.get(name))
+            show_mean(name, fast_returns(env_id, agent, batches, size), in_use.get(name))
         elif not quick:
             agent = GreedyPolicy(env_id) if name == "optimal" else build(task, name)
             returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
@@ -171,16 +172,15 @@ def measure_environment(
                 same = fast_returns(env_id, make_controller(env_id, task.reference), batches, size)
             show(name, *without_luck(returns, same), len(returns), in_use.get(name))
     if task.reference:
-        returns = fast_returns(env_id, make_controller(env_id, task.reference), batches, size, REFERENCE_SEED)
-        show("reference", *mean_and_error(returns), len(returns), used)
+        reference = make_controller(env_id, task.reference)
+        show_mean("reference", fast_returns(env_id, reference, batches, size, REFERENCE_SEED), used)
         kept.setdefault("reference", found["reference"])
     if task.optimum:
-        best = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH, size) for k in range(batches)])
-        show("optimum", *mean_and_error(best), len(best), (scale or {}).get("optimum"))
+        largest = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH, size) for k in range(batches)])
+        show_mean("optimum", largest, (scale or {}).get("optimum"))
     if task.open:
         agent = make_controller(env_id, task.open.controller, **task.open.options)
-        returns = fast_returns(env_id, agent, batches, size, **task.open.options)
-        show("privileged", *mean_and_error(returns), len(returns))
+        show_mean("privileged", fast_returns(env_id, agent, batches, size, **task.open.options))
     if not scale:
         first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
         scale = {"random": found["random"]["mean"], "best": found[first]["mean"]}

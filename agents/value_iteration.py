@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.errors import UserError
 from lag_envs.stepping.cache import jit
 from lag_envs.store import write_file
 
@@ -40,7 +41,7 @@ CHUNK = 1_000_000
 RECORD = 1.0
 
 
-class CacheError(Exception):
+class CacheError(UserError):
     """A cached value function cannot be used; the message says what to do."""
 
 

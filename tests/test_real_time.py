@@ -144,4 +144,4 @@ def test_calls_by_the_clock(tmp_path, capsys, monkeypatch):
 def test_numbers_of_episodes_are_checked(capsys):
     for option, least in (("--clocked", 1), ("--episodes", 2)):
         assert real_time.main([option, "0"]) == 2
-        assert f"{option} must be at least {least}, got 0" in capsys.readouterr().err
+        assert f"{option} must lie between {least} and 2147483647, got 0" in capsys.readouterr().err

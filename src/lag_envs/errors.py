@@ -64,6 +64,11 @@ def reason(error: OSError) -> str:
     return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
+def one_line(error: BaseException, most: int = 200) -> str:
+    """Return an error's kind and text as one line of so many characters at most."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:most]
+
+
 @contextmanager
 def terminable() -> Iterator[None]:
     """Treat SIGTERM like Ctrl-C."""

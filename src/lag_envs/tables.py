@@ -84,3 +84,22 @@ def rate_text(value: float) -> str:
             value /= size
             return f"{value:.{max(0, 2 - (value >= 9.995) - (value >= 99.95))}f} {unit}"
     return f"{value:.0f}"
+
+
+def mean_with_error(mean: float, error: float, most: int = 6, exact: int = 4) -> str:
+    """Return a mean with its standard error, which decides the digits.
+
+    Parameters
+    ----------
+    mean, error : float
+        The numbers.
+    most, exact : int
+        Digits after the point: at most, and if the error is 0.
+
+    Examples
+    --------
+    >>> mean_with_error(418.987, 0.0117), mean_with_error(0.000165, 0.0)
+    ('418.987 ± 0.012', '0.0002 ± 0.0000')
+    """
+    digits = exact if error <= 0.0 else min(most, max(0, 1 - math.floor(math.log10(error))))
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"

@@ -27,7 +27,7 @@ from lag_envs.scenes.declaring import complete
 from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
-from lag_envs.tables import markdown_table, number_text
+from lag_envs.tables import markdown_table, mean_with_error, number_text
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured_entry
@@ -35,7 +35,6 @@ from tools.docs import equations
 from tools.docs.markdown import (
     default_text,
     first_line,
-    mean_with_error,
     parameter_descriptions,
     sections,
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 import re
 from typing import Any
 
@@ -19,18 +18,6 @@ def sections(kind: type) -> dict[str, str]:
     """Return a docstring's text by its ``##`` headings; text before them has the empty heading."""
     parts = re.split(r"^## (.+)$", inspect.getdoc(kind) or "", flags=re.MULTILINE)
     return dict(zip(["", *parts[1::2]], (part.strip() for part in parts[::2]), strict=True))
-
-
-def mean_with_error(mean: float, error: float) -> str:
-    """Return a mean with its standard error, which decides the digits.
-
-    Examples
-    --------
-    >>> mean_with_error(418.987, 0.0117), mean_with_error(0.000165, 0.0)
-    ('418.987 ± 0.012', '0.0002 ± 0.0000')
-    """
-    digits = 4 if error <= 0.0 else max(0, 1 - math.floor(math.log10(error)))
-    return f"{mean:.{min(digits, 6)}f} ± {error:.{min(digits, 6)}f}"
 
 
 def parameter_descriptions(kind: type) -> dict[str, str]:

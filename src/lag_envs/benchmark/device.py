@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from lag_envs.device import DeviceEnvs
+from lag_envs.errors import one_line
 from lag_envs.progress import progress
 
 #: Numbers copied to measure the memory, more than any cache holds.
@@ -84,7 +85,7 @@ def measured(
             except KeyboardInterrupt:
                 return report
             except Exception as error:
-                row["problem"] = " ".join(f"failed: {type(error).__name__}: {error}".split())[:200]
+                row["problem"] = f"failed: {one_line(error)}"
             else:
                 row["steps"], row["replayed"] = (BATCHES * size * rate for rate in rates)
                 per_step = traffic(envs) / report["bandwidth"]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from lag_envs.errors import one_line
 from lag_envs.progress import progress
 from lag_envs.workers import stopping_point
 
@@ -70,8 +71,7 @@ def excused(row: Contestant) -> Iterator[None]:
         yield
     except Exception as error:
         missing = isinstance(error, ModuleNotFoundError) and error.name == row.library
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        row.problem = "not installed" if missing else f"failed: {text[:200]}"
+        row.problem = "not installed" if missing else f"failed: {one_line(error)}"
 
 
 def calibrate(run: Run, seconds: float, clock: Clock) -> int:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 #: A scene with a dedicated step, a system for the general series, and the methods that step both.
 SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
-#: Columns of the general table that are not rivals, and the names of rivals in the picture.
+#: The names of rivals in the picture.
 RIVALS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
 Points = list[tuple[float, float]]
 

@@ -22,6 +22,7 @@ from typing import Any
 
 import lag_envs
 from lag_envs import store
+from lag_envs.errors import one_line
 from lag_envs.host import installed_versions, machine
 from lag_envs.progress import progress
 from lag_envs.workers import as_they_finish, died, processes
@@ -191,4 +192,4 @@ def error_line(error: BaseException) -> str:
     """
     if isinstance(error, ModuleNotFoundError) and error.name:
         return f"{error.name.partition('.')[0]} is not installed"
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+    return one_line(error, 300)
