@@ -108,15 +108,6 @@ class Grid:
             cells = cells * np.int32(len(axis)) + cell.astype(np.int32)
         return cells, places
 
-    def interpolate(self, values: NDArray[np.float32], coordinates: Array) -> Array:
-        """Return values given at the nodes, (*shape,), interpolated at coordinates (n, d)."""
-        if values.shape != self.shape:
-            raise ValueError(f"values must have the shape of the grid, {self.shape}, got {values.shape}")
-        cells, places = self.locate(coordinates)
-        return interpolate_rows(
-            values.reshape(1, -1), np.zeros(len(cells), np.int64), cells, places, self.strides
-        )
-
     @property
     def strides(self) -> NDArray[np.int64]:
         """Strides: the distance of neighbours along each axis in the flat array."""

@@ -1,7 +1,6 @@
 """Processes that work on a board at once, or are killed while doing so. Run by tests/test_board_log.py."""
 
 import collections
-import json
 import os
 import random
 import shutil
@@ -11,6 +10,7 @@ import time
 from pathlib import Path
 
 import fake_submissions
+from boards import lines
 from fake_submissions import write
 
 from lag_envs.leaderboard import (
@@ -42,10 +42,6 @@ def ended(child):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def events(board):
-    return [json.loads(line) for line in board.log.read_bytes().splitlines()]
-
-
 def add(board, folder, nonce):
     """Do the same as the command `leaderboard add FOLDER --nonce NONCE`."""
     entry = board.add(submission.load(folder))
@@ -62,7 +58,7 @@ def check_whole(board, expected):
     for entry in state.entries.values():
         assert submission.load(board.submission(entry.id)).digest == entry.digest
         board.result(entry)
-    counts = collections.Counter((e["event"], e["id"]) for e in events(board) if "id" in e)
+    counts = collections.Counter((e["event"], e["id"]) for e in lines(board) if "id" in e)
     assert set(counts.values()) <= {1}, counts
     left = [path for path in board.folder.rglob("*") if path.name.startswith(".")]
     assert not left, left

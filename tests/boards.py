@@ -3,9 +3,18 @@
 import json
 
 import fake_submissions
+import pytest
 from fake_submissions import write
 
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.pending import finish
+
+
+@pytest.fixture(name="board")
+def fake_board(tmp_path, monkeypatch):
+    """A board for fake submissions."""
+    fake_submissions.install(monkeypatch.setattr)
+    return Board(tmp_path / "board")
 
 
 def add(board, name="PPO", nonce=None, **told):
@@ -18,8 +27,12 @@ def add(board, name="PPO", nonce=None, **told):
     return id
 
 
+def lines(board):
+    return [json.loads(line) for line in board.log.read_bytes().splitlines()]
+
+
 def events(board):
-    return [json.loads(line)["event"] for line in board.log.read_bytes().splitlines()]
+    return [line["event"] for line in lines(board)]
 
 
 def states(board):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
+from boards import lines
 from covering import every, slow
 from fake_submissions import ENV, write
 
@@ -106,10 +107,6 @@ def refused(board):
 
 
 # --- forging ------------------------------------------------------------------------------------------------
-
-
-def lines(board):
-    return [json.loads(line) for line in board.log.read_bytes().splitlines()]
 
 
 def relog(board, told, chain=True):

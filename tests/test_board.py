@@ -7,12 +7,12 @@ from functools import partial
 
 import fake_submissions
 import pytest
-from boards import add, events, states
+from boards import add, events, fake_board, states  # noqa: F401
 from fake_submissions import ENV, write
 
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import submission
-from lag_envs.leaderboard.board import Board, BoardError, id_of
+from lag_envs.leaderboard.board import BoardError, id_of
 from lag_envs.leaderboard.parallel import map_submissions
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
@@ -21,14 +21,6 @@ from lag_envs.leaderboard.submission import Refused
 from lag_envs.leaderboard.verify import verify_folder
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import incline, pivoted_bar
-
-
-@pytest.fixture
-def board(tmp_path, monkeypatch):
-    """A board for fake submissions."""
-    fake_submissions.install(monkeypatch.setattr)
-    return Board(tmp_path / "board")
-
 
 # --- states ---
 

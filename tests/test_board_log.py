@@ -12,21 +12,13 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
-from boards import add, events, states
+from boards import add, events, fake_board, lines, states  # noqa: F401
 from covering import slow
 from fake_submissions import write
 
 from lag_envs.leaderboard.board import Board, BoardError
 from lag_envs.leaderboard.log import fold, parse
 from lag_envs.leaderboard.standings import board_data
-
-
-@pytest.fixture
-def board(tmp_path, monkeypatch):
-    """A board for fake submissions."""
-    fake_submissions.install(monkeypatch.setattr)
-    return Board(tmp_path / "board")
-
 
 # --- the log ---
 
@@ -104,8 +96,8 @@ def test_a_damaged_line_is_named(board, line):
 
 
 def ids(board):
-    lines = (json.loads(line) for line in board.log.read_bytes().splitlines()[:-1])
-    return [line["id"] for line in lines if "id" in line]
+    told = (json.loads(line) for line in board.log.read_bytes().splitlines()[:-1])  # the last one is damaged
+    return [line["id"] for line in told if "id" in line]
 
 
 def chained(*events):
@@ -119,7 +111,7 @@ def chained(*events):
 
 def rewritten(board, change):
     """Let a function change a board's events, and chain them again."""
-    told = [json.loads(line) for line in board.log.read_bytes().splitlines()]
+    told = lines(board)
     change(told)
     board.log.write_bytes(chained(*({k: v for k, v in event.items() if k != "prev"} for event in told)))
 

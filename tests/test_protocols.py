@@ -4,26 +4,19 @@ import json
 
 import fake_submissions
 import pytest
-from boards import add, events, states
+from boards import add, events, fake_board, states  # noqa: F401
 from fake_submissions import ENV
 
 from lag_envs import scores
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import protocol, ranking, standings, submission
-from lag_envs.leaderboard.board import Board, BoardError, closed
+from lag_envs.leaderboard.board import BoardError, closed
 from lag_envs.leaderboard.log import LogLine, fold, parse
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import Refused
 from lag_envs.scores import known_returns
 from lag_envs.tasks import pivoted_bar
-
-
-@pytest.fixture
-def board(tmp_path, monkeypatch):
-    """A board for fake submissions."""
-    fake_submissions.install(monkeypatch.setattr)
-    return Board(tmp_path / "board")
 
 
 def test_a_new_protocol_verifies_anew_what_is_there_and_freezes_the_old(board):

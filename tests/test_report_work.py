@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from covering import every, slow
 
-from lag_envs.report import diagrams, peers, verdicts, work_precision
+from lag_envs.report import diagrams, peers, work_precision
+from lag_envs.report import work_precision_results as results
 from lag_envs.report.cases import VARIANTS, ensemble
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
@@ -210,7 +211,7 @@ def test_all_libraries_at_their_finest(package, name, mode):
     for method, settings in peers.PEERS[package].settings.items():
         rival = peers.PEERS[package](method, settings[-1])
         if rival.batched or mode == "single":
-            assert worst(rival, name, mode == "batch", count=3) < verdicts.ACCURATE, method
+            assert worst(rival, name, mode == "batch", count=3) < results.ACCURATE, method
 
 
 def test_a_scene_of_ones_own():
@@ -367,7 +368,7 @@ def test_sentences_count_what_the_table_has():
     rng = np.random.default_rng(1)
     rows = []
     for variant in VARIANTS:
-        for horizon in verdicts.HORIZONS:
+        for horizon in results.HORIZONS:
             place = {"variant": variant, "horizon": horizon}
             rows += both(LAG_ENVS, 100.0, 1e-16, family="lag_envs", **place)
             rows += [
@@ -426,7 +427,7 @@ def test_committed_claims_follow_from_the_table():
     section = committed()
     table = next(t for t in section["tables"] if t["name"].endswith("targets"))
     rows = [dict(zip(table["columns"], line, strict=True)) for line in table["rows"]]
-    for horizon, target in verdicts.CLAIMED.items():
+    for horizon, target in results.CLAIMED.items():
         here = [r for r in rows if (r["horizon"], r["error"]) == (horizon, target)]
         lost = [r for r in here if r["fastest other"] and (r["other / lag_envs"] or 0.0) < 1.0]
         claim = next(c for c in section["claims"] if c["text"].startswith(f"{horizon.capitalize()}: nobody"))
@@ -447,15 +448,15 @@ def test_only_what_is_shipped_is_committed_as_lag_envs():
 def test_jobs_are_brought_to_one_scale():
     """A rival whose job ran on a machine of twice the speed is not counted as twice as fast."""
     slow = both("Taylor", 300.0, 1e-13, family="heyoka", clock=200.0)
-    ns = {p.name: p.ns for p in verdicts.gathered(OWN + slow)}
+    ns = {p.name: p.ns for p in results.gathered(OWN + slow)}
     assert ns == {LAG_ENVS: 100.0, "heyoka Taylor": 150.0}
 
 
 def test_without_a_batch_it_is_one_after_the_other():
     radau = row("Radau", 300.0, 1e-13, family="scipy", batched=False)
-    assert [p.mode for p in verdicts.gathered([radau])] == ["single", "batch"]
+    assert [p.mode for p in results.gathered([radau])] == ["single", "batch"]
     lost = row("Taylor", 300.0, 1e-13, family="heyoka")  # its batch was not run
-    assert [p.mode for p in verdicts.gathered([lost])] == ["single"]
+    assert [p.mode for p in results.gathered([lost])] == ["single"]
 
 
 def test_errors_below_amplified_rounding_are_none():
@@ -480,7 +481,7 @@ def test_the_picture_has_the_fastest_form_of_each():
     assert len(figure.axes) == 2
     known = {*diagrams.STYLES, *diagrams.OWN_STYLES}
     assert {
-        f"{verdicts.LIBRARIES[p]} {m}".partition(",")[0] for p, c in peers.PEERS.items() for m in c.settings
+        f"{results.LIBRARIES[p]} {m}".partition(",")[0] for p, c in peers.PEERS.items() for m in c.settings
     } <= known
     assert set(METHODS) <= known
 
@@ -495,7 +496,7 @@ def test_long_horizons_are_exact_products():
 
 
 def test_targets_are_compared_once():
-    found = verdicts.compared(verdicts.gathered(OWN), {})
+    found = results.compared(results.gathered(OWN), {})
     assert [(d.mode, d.target) for d in found] == [(mode, target) for mode in MODES for target in TARGETS]
 
 

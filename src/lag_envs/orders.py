@@ -15,13 +15,14 @@ from lag_envs.stepping.series import LARGEST_ORDER
 ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
 #: A lower order is preferred to one that is faster by less than this factor, which is within the noise.
 SAME = 1.02
+#: Steps of a sample.
+STEPS = 20
 
 
 def measure_orders(
     task: type[Any],
     num_envs: int = 1024,
     rounds: int = 9,
-    steps: int = 20,
     advance: Callable[[], Any] = lambda: None,
 ) -> dict[int, float]:
     """Return the time of a step [ns] for each order of the series.
@@ -35,8 +36,8 @@ def measure_orders(
         A task whose scene has no flow of its own.
     num_envs : int
         Size of the batch.
-    rounds, steps : int
-        Number of samples, and steps of each.
+    rounds : int
+        Number of samples, each of `STEPS` steps.
     advance : callable
         Called after each sample.
     """
@@ -57,9 +58,9 @@ def measure_orders(
         for order, times in samples.items():
             envs.order = order
             begin = time.perf_counter()
-            for action in actions[:steps]:
+            for action in actions[:STEPS]:
                 envs.step(action)
-            times.append((time.perf_counter() - begin) / (steps * num_envs) * 1e9)
+            times.append((time.perf_counter() - begin) / (STEPS * num_envs) * 1e9)
             advance()
     envs.close()
     return {order: median(times) for order, times in samples.items()}

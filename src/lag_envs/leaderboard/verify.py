@@ -212,15 +212,10 @@ def _plain(values: Array) -> list[Any]:
 # --- the command --------------------------------------------------------------------------------------------
 
 
-def verify_folder(
-    folder: Path,
-    nonce: str = "",
-    episodes: int = protocol.EPISODES,
-    progress: Callable[[int, int], Any] | None = None,
-) -> dict[str, Any]:
+def verify_folder(folder: Path, nonce: str = "", episodes: int = protocol.EPISODES) -> dict[str, Any]:
     """Return the result of `verify` for a folder, or ``{"refused": reason}``."""
     try:
-        return verify(load(folder), nonce, episodes, progress)
+        return verify(load(folder), nonce, episodes)
     except Refused as error:
         return {"refused": str(error)}
 

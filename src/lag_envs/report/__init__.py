@@ -13,7 +13,6 @@
 `rivals`, `peers`      lag_envs, those integrators, and other libraries, all behind one interface
 `work_precision` ...   one module per section: its jobs and measurements; `..._results`: their presentation
 `points`               errors and times of methods, at their settings
-`verdicts`             who is faster at which error, from the points of `work_precision`
 `diagrams`             the same points as pictures
 =====================  ====================================================================================
 

@@ -237,7 +237,7 @@ def _claims(rows: list[Row]) -> list[Claim]:
     above = max(flows, key=_ratio, default=None)
     furthest = max(flows, key=lambda r: r["error"]["the end"], default=None)
     worst = max(series, key=_share, default=None)
-    claims = [
+    return [
         Claim(
             f"With exact flows every error stays below {ROUNDINGS:g} times one rounding of the start, as "
             "amplified by the system itself.",
@@ -281,7 +281,6 @@ def _claims(rows: list[Row]) -> list[Claim]:
             f"{max(apart):.1g} apart in {len(apart)} episodes" if apart else "",
         ),
     ]
-    return claims
 
 
 def _of_steps(rows: list[Row], limit: float, subject: str) -> Claim:

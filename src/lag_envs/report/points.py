@@ -1,4 +1,4 @@
-"""Methods at their settings as points: errors and times, for verdicts to compare and diagrams to show."""
+"""Methods at their settings as points: errors and times, to be compared and drawn."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Error against time: the shipped stepping, the usual integrators, other libraries.
 
 Every rival runs in its fastest form (`variant_rivals`, `peers`), alone and in a batch, and the errors are
-those of the timed calls. `verdicts` compares and reports the measurements, `diagrams` draws them.
+those of the timed calls. `work_precision_results` compares and reports the measurements, `diagrams` draws
+them.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from lag_envs.report.rivals import CompiledMethod, Rival, ShippedStepping
 from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import FlowSteps, Sample, interleaved
-from lag_envs.report.verdicts import content
+from lag_envs.report.work_precision_results import content
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.flows import Flow
 

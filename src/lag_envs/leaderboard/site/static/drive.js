@@ -1324,7 +1324,5 @@
     return { show: () => show(1), get episode() { return me; } };
   }
 
-  const api = { Episode, agentOf, readLink, writeLink, hexOf, actionOf, lacking, open };
-  if (typeof module === "object") module.exports = api;
-  else window.lagEnvs.put(api);
+  window.lagEnvs.put({ Episode, agentOf, hexOf, lacking, open });
 })();
