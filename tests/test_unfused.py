@@ -194,7 +194,7 @@ def test_a_picture_that_cannot_be_printed_is_left_out():
 
 @pytest.mark.slow
 def test_scripts_do_not_depend_on_the_process():
-    code = "from lag_envs.envs.unfused import UnfusedProgram as U; from lag_envs.tasks import TASKS as T;"
+    code = "from lag_envs.envs.scripted import UnfusedProgram as U; from lag_envs.tasks import TASKS as T;"
     code += "print(*(U(T[id]()).digest for id in sorted(T) if not T[id].imperfections))"
     seen = {
         subprocess.run(

@@ -8,7 +8,7 @@ A link ends with ``#drive=`` and seven fields separated by ``~``::
 to a byte, low bits first: for each run of equal keys, a number per control, then the length of the run. For a
 control in [-1, 1] the number counts multiples of 1/`LEVELS`, encoded as 2n if positive and as -2n - 1 if
 negative; a discrete action is encoded in the same way. The return, in full, is the 16 hexadecimal digits of a
-double; the step is the digest of the script that made it (`lag_envs.envs.unfused`), and the check is the
+double; the step is the digest of the script that made it (`lag_envs.envs.scripted`), and the check is the
 CRC-32 of everything before it.
 
 All numbers are recomputed by that script, whose bits are the same on every machine. So a claimed return is

@@ -1,6 +1,6 @@
 """The whole step of a batch as C++, for a GPU's compiler or any other.
 
-The text consists of a task's script (`lag_envs.envs.unfused`), printed in C++, and of two kernels around it.
+The text consists of a task's script (`lag_envs.envs.scripted`), printed in C++, and of two kernels around it.
 ``begin`` starts episodes. ``step`` takes a control step: control, guard, motion in certified substeps,
 reward, ending, kick, observation, and the start of the next episode if one is over. One thread computes each
 environment, from that environment's numbers only. Without a GPU's compiler the kernels are loops over the
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from lag_envs.envs.unfused import UnfusedProgram
+from lag_envs.envs.scripted import UnfusedProgram
 from lag_envs.stepping import primitives
 from lag_envs.stepping.script import CPP, CPP_SINGLE
 from lag_envs.tasks.base import Task

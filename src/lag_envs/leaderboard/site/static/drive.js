@@ -1,7 +1,7 @@
 "use strict";
 /* Driving an environment in the page. Loaded on demand.
  *
- * The step comes as functions that Python printed (lag_envs/envs/unfused.py); no physics is written here.
+ * The step comes as functions that Python printed (lag_envs/envs/scripted.py); no physics is written here.
  * Arrays are named as there: k constants, f one environment's row, a action, d draws in [0, 1), p poses.
  * Of the imperfections of sensors and actuators, scripts know drawn parameters, noise and delayed actions.
  *

@@ -1,0 +1,212 @@
+"""Derivatives of control steps by the general series, forwards and backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
+from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.series import LARGEST_ORDER
+
+if TYPE_CHECKING:
+    from lag_envs.stepping.general import SeriesStepper
+
+#: How many terms more the series of derivatives has.
+FURTHER = 1
+
+
+class SeriesTangent:
+    """Derivatives of control steps of one scene.
+
+    Columns are computed only for variables that the equations contain: with respect to a coordinate that does
+    not occur, the derivatives are those of a shift.
+
+    Parameters
+    ----------
+    stepper : SeriesStepper
+        The scene's stepper.
+    record : SeriesRecord
+        The record of the step, made with tangents.
+    constants, numbers : mapping from str to float
+        Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
+    by : tuple of str
+        Parameters with respect to which derivatives are taken, besides state and controls.
+    """
+
+    def __init__(
+        self,
+        stepper: SeriesStepper,
+        record: SeriesRecord,
+        constants: Mapping[str, float],
+        numbers: Mapping[str, float],
+        by: tuple[str, ...],
+    ) -> None:
+        from lag_envs.stepping.machine import slots_for
+
+        self._stepper, self._numbers, self._given, self._by = stepper, numbers, record.given, by
+        self._record = record
+        n = record.size
+        seen = {(node.op, node.index) for node in record.nodes}
+        self._still = [i for i in range(n) if ("place", i) not in seen]
+        self._free = [i for i in self._still if ("velocity", i) not in seen]
+        self._moving = [*(f"q{i}" for i in range(n)), *(f"v{i}" for i in range(n))]
+        without = {*(f"q{i}" for i in self._still), *(f"v{i}" for i in self._free)}
+        inputs = [name for name in record.given if name not in record.constants]
+        used = {source for slopes in record.tangents.values() for source in slopes}
+        inputs += [f"parameter_{name}" for name in by if f"parameter_{name}" in used]
+        self._columns = tuple(name for name in [*self._moving, *inputs] if name not in without)
+        self._first = np.zeros((2 * n, slots_for(len(self._columns))))
+        for i, name in enumerate(self._moving):
+            if name in self._columns:
+                self._first[i, self._columns.index(name)] = 1.0
+        self._constants = np.array([constants.get(name, 0.0) for name in record.given])
+        self._known_linear: dict[float, tuple[Any, ...]] = {}
+
+    def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
+        """Return the derivatives of the end states with respect to states, controls and parameters.
+
+        Parameters
+        ----------
+        states : ndarray, shape (n, n_state)
+            Where the steps begin.
+        controls : ndarray, shape (n, n_controls)
+            The controls that are held.
+        dt : float
+            Length of the step [s].
+        order : int
+            Order of the series.
+
+        Returns
+        -------
+        derivatives : ndarray, shape (n, n_state, n_state + n_controls + n_parameters)
+            The derivatives; None if a step was refused.
+        refused : int
+            The row whose step was refused, counted from 1; 0 if none was.
+        """
+        count, size, first = len(states), len(self._moving) // 2, len(self._given)
+        xp = VariableFunctions()
+        numbers = [self._numbers.get(f"p_{name}", 0.0) for name in self._by]
+        y, u, p = variables_of(states, controls, np.broadcast_to(numbers, (count, len(numbers))))
+        moved = {f"parameter_{name}": number for name, number in zip(self._by, p, strict=True)}
+        changed = {f"p_{name}": number for name, number in zip(self._by, p, strict=True)}
+        k: dict[str, Any] = {name: changed.get(name, x) for name, x in self._numbers.items()}
+        before = self._stepper.prepare(xp, y, u, k) | moved
+        values = np.empty((count, first + 2 * size))
+        values[:, :first] = self._constants
+        for i, name in enumerate([*self._given, *self._moving]):
+            if name in before:
+                values[:, i] = getattr(before[name], "value", before[name])
+        slopes = np.repeat(self._first[None], count, axis=0)
+        refused = self._advance(values, slopes.reshape(count, self._first.size), dt, order)
+        if refused:
+            return None, refused
+
+        def stack(names: Sequence[str]) -> Any:
+            found = np.zeros((len(names), len(y) + len(u) + len(p), width))
+            for i, name in enumerate(names):
+                found[i] = getattr(before[name], "slopes", 0.0)
+            return found.transpose(2, 0, 1)
+
+        # If no rate is held, these derivatives are the same for all states.
+        width = max(np.shape(getattr(x, "slopes", 0.0))[-1:] for x in before.values())[0]
+        ends = slopes[..., : len(self._columns)] @ stack(self._columns)
+        start = stack(self._moving)
+        for i in self._still:
+            ends[:, i] += start[:, i]
+        for i in self._free:
+            ends[:, i] += dt * start[:, size + i]
+            ends[:, size + i] += start[:, size + i]
+        after = [Variable(values[:, first + i], ends[:, i].T) for i in range(2 * size)]
+        finished = self._stepper.finish(xp, after[:size], after[size:], y, u, dt, k)
+        return stacked(finished, count), 0
+
+    def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
+        """Return gradients with respect to states, controls and parameters from those of the end states.
+
+        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`. The
+        series goes further than `order`: derivatives need some terms more than the motion, and a step that
+        is taken again, shorter, costs more than they do.
+        """
+        if self._stepper.mechanics.coupling:
+            found, refused = self.jacobian(states, controls, dt, order)
+            return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
+        further = min(order + FURTHER, LARGEST_ORDER)
+        linear = self._known_linear.get(dt) or self._linear(dt)
+        self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
+        given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
+        found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
+        some = np.arange(len(states))
+        while len(some):  # again those whose substeps were too long for the derivatives
+            every = len(some) == len(states)
+            shorter, pulled = longest[some], found if every else np.empty((self._width, len(some)))
+            parts = (given, seeds) if every else (given[:, some].copy(), seeds[:, some].copy())
+            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further):
+                # In reverse mode no substep is longer than the shortest, so there may be too many. In forward
+                # mode substeps grow again.
+                i = some[refused - 1 : refused]
+                slopes, refused = self.jacobian(states[i], controls[i], dt, order)
+                if refused:
+                    return None, int(i[0]) + 1
+                found[:, i] = np.einsum("ni,nij->jn", cotangents[i], slopes)
+                some = np.setdiff1d(some, i)
+                continue
+            if not every:
+                found[:, some] = pulled
+            too_long = shorter < longest[some]
+            longest[some] = shorter
+            some = some[too_long]
+        return found.T, 0
+
+    def _linear(self, dt: float) -> tuple[Any, ...]:
+        """Return the constants, and derivatives of the series' start and of the end state, for `_pull`.
+
+        If no rate is held, all are the same for all states.
+        """
+        xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
+        ends, y, u, p = variables_of(
+            *(
+                np.zeros((1, n))
+                for n in (moving, len(layout.state), len(self._stepper.arguments), len(self._by))
+            )
+        )
+        before = self._stepper.prepare(xp, y, u, self._numbers)
+        before |= {f"parameter_{name}": x for name, x in zip(self._by, p, strict=True)}
+
+        def by_start(names: Sequence[str]) -> Any:
+            found = np.zeros((len(names), moving + self._width))
+            for row, name in zip(found, names, strict=True):
+                if name not in self._record.constants:
+                    row[:] = np.reshape(getattr(before.get(name, 0.0), "slopes", 0.0), -1)
+            return found[:, moving:]
+
+        q, v = ends[: moving // 2], ends[moving // 2 :]
+        by_end = stacked(self._stepper.finish(xp, q, v, y, u, dt, self._numbers), 1)[0]
+        constants = np.concatenate([self._constants, np.zeros(moving)])
+        starts = by_start([*self._given, *self._moving])[:, : len(y) + len(u)]
+        parts = constants, starts, by_start([*self._moving, *self._sources]), by_end
+        return tuple(map(np.ascontiguousarray, parts))
+
+    @property
+    def _width(self) -> int:
+        """Number of entries of state, controls and parameters together."""
+        return len(self._stepper._layout.state) + len(self._stepper.arguments) + len(self._by)
+
+    @cached_property
+    def _advance(self) -> Callable:
+        from lag_envs.stepping.driver import compile_advance_tangents
+
+        return compile_advance_tangents(self._record, self._columns)
+
+    @cached_property
+    def _sources(self) -> tuple[str, ...]:
+        return tuple(name for name in self._columns if name not in self._moving)
+
+    @cached_property
+    def _pull(self) -> Callable:
+        from lag_envs.stepping.driver import compile_pull_all
+
+        return compile_pull_all(self._record, self._sources)
