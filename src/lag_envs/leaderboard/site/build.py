@@ -164,7 +164,8 @@ def render(
 
     style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
     script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
-    drive = keep("drive", "js", (STATIC / "drive.js").read_text("utf-8"))
+    parts = "\n".join((STATIC / f"{name}.js").read_text("utf-8") for name in ("episode", "drive"))
+    drive = keep("drive", "js", f'"use strict";\n(() => {{\n{parts}}})();\n')
     boards, taken = [], {"index"}
     for given in data["environments"]:
         scenery = Scenery(str(given["id"]))

@@ -4,7 +4,7 @@
  * Submissions are untrusted: their contents become text (textContent) or numbers, never markup.
  *
  * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, start.
- * Driving itself is in drive.js, which is loaded on demand.
+ * Driving itself is in episode.js and drive.js, which are loaded on demand.
  */
 (() => {
   const TURN = 2 * Math.PI;
