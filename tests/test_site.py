@@ -10,9 +10,11 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
+from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import render, write_page
+from lag_envs.leaderboard.site.driving import sliders
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum
@@ -320,3 +322,17 @@ def test_contrast(theme):
         assert contrast(name, "stage") >= 3.0, name
     for i in range(8):
         assert contrast(f"c{i}", "paper") >= 4.5, f"letters on c{i}"
+
+
+@pytest.mark.parametrize(
+    "kind, names",
+    [
+        (incline.Brake, ["mass", "radius", "tilt", "gravity"]),
+        (
+            cylinder_in_cylinder.Tilt,
+            ["mass", "shell_radius", "radius", "damping", "gravity", "control limit"],
+        ),
+    ],
+)
+def test_parameters_that_the_script_follows_have_sliders(kind, names):
+    assert [slider["name"] for slider in sliders(kind, Unfused(kind()))] == names
