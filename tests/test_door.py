@@ -1,5 +1,6 @@
 """A scene's mistakes are refused when its class is used, by name and with the remedy."""
 
+import contextlib
 import dataclasses
 import math
 import random
@@ -210,6 +211,18 @@ INVALID = {
     "fourth power of a sum": (
         {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + (v.x - v.y) ** 4},
         "kinetic; degree 4; two at most",
+    ),
+    "arguments in another order": (
+        {"dissipation": lambda self, v, q, u, xp: 0.5 * self.mass * v.x**2},
+        "dissipation; (self, q, v, u, xp); (self, v, q, u, xp)",
+    ),
+    "dissipation that is a force": (
+        {"dissipation": lambda self, q, v, u, xp: -self.mass * v.x},
+        "dissipation; constant force; half of the power lost",
+    ),
+    "dissipation without velocities": (
+        {"dissipation": lambda self, q, v, u, xp: self.mass * q.x**2},
+        "dissipation; no velocity; no effect",
     ),
     "third degree": (
         {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + v.x**3},
@@ -618,6 +631,28 @@ def test_limits_that_no_parameter_meets(limits, words):
     with pytest.raises(FormulaError, match=re.escape(words)):
         parameter(2.5, "m", **limits)
     parameter(3.0, "m", least=3.0, most=3.0)
+
+
+@pytest.mark.parametrize(
+    "potential",
+    [
+        lambda self, q, xp: q.x / (self.spring - 1.0),
+        lambda self, q, xp: xp.sqrt(self.spring - 2.0) * q.x,
+        lambda self, q, xp: xp.exp(800.0 * self.spring) * q.x,
+    ],
+)
+def test_parameters_for_which_a_formula_has_no_value(potential):
+    scene = changed(potential=potential)(spring=1.0)
+    rest = [0.1] * len(scene.state_names)
+    message = r"a coefficient of the motion is undefined or not finite: \w+\(.*spring=1.0"
+    for call in (
+        lambda: scene.simulate(rest, [[0.0] * len(scene.control_names)], 0.1),
+        lambda: scene.jacobian(rest, [0.0] * len(scene.control_names), 0.1),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    with contextlib.suppress(ValueError):  # or not finite
+        assert not all(map(math.isfinite, scene.acceleration(rest).values()))
 
 
 def test_unknown_parameter():

@@ -15,6 +15,7 @@ from test_vector import assert_same, pair
 
 import lag_envs
 from lag_envs import replay
+from lag_envs.envs import program as program_module
 from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
@@ -200,11 +201,9 @@ def test_what_is_off_leaves_everything_as_it_is():
 
 def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch):
     # No line of imperfections is left: no row, no constant, no key.
-    import lag_envs.envs.lines as module
-
     printed: list[str] = []
     monkeypatch.setattr(
-        module, "compile_function", lambda name, source, *_, **options: printed.append(source)
+        program_module, "compile_lines", lambda *given, **_: printed.append("\n".join(given[2]))
     )
     task = make_task(ID)
     program = Program(task, absent_from(task.formulas.constants()))

@@ -26,7 +26,7 @@ from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, T
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.checks import SMALLEST_LAG
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of
-from lag_envs.stepping import driver, general
+from lag_envs.stepping import compiling, driver, general
 from lag_envs.stepping.certificate import Certificate
 from lag_envs.stepping.compiling import BLOCK, absent_from
 from lag_envs.stepping.driver import compile_advance_block
@@ -355,7 +355,7 @@ def rows_of(scene, state, applied, commands, lags, fused=True, compiled=True):
 def test_unfused_bits_are_those_of_plain_numbers(monkeypatch):
     scene, state, applied, command, lags = TROLLEY
     compiled = rows_of(scene, state, applied, [command] * 2, lags, fused=False)
-    monkeypatch.setattr(general, "compile_function", in_python)
+    monkeypatch.setattr(compiling, "compile_function", in_python)
     monkeypatch.setattr(driver, "compile_advance", advance_in_python)
     python = rows_of(scene, state, applied, [command] * 2, lags, fused=False, compiled=False)
     np.testing.assert_array_equal(compiled, python)

@@ -432,6 +432,10 @@ def _mistaken(**changes):
             "reward returns an array; it must return a number",
         ),
         (
+            {"reward": lambda self, after, before, control, target, dt, xp: after.x - before.x},
+            r"reward must be reward\(self, before, after, .* got \(self, after, before, ",
+        ),
+        (
             {"reward": lambda self, *_: np.random.default_rng().random()},
             "another result when it is run again",
         ),
@@ -753,3 +757,48 @@ def test_example(monkeypatch):
         "total"
     ]
     assert after == pytest.approx(before, abs=1e-14)
+
+
+def test_a_friction_that_is_zero_in_part_of_a_batch():
+    """The certificate then covers a friction that does not act, so substeps and roundings may differ."""
+
+    class Sled(Scene):
+        friction: float = parameter(1.0, "N", least=0.0)
+        coordinates = {"x": "m", "a": "rad"}
+        controls = {"force": "N"}
+
+        def kinetic(self, q, v, xp):
+            return v.x**2 + 0.1 * v.a**2 + 0.2 * v.x * v.a * xp.cos(q.a)
+
+        def potential(self, q, xp):
+            return -2.0 * xp.cos(q.a)
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.force - self.friction * xp.tanh(v.x / 0.02)}
+
+    class Slide(Task):
+        id = "OwnSlide-v0"
+        scene = Sled
+        interval, steps = 0.05, 100
+        action = {"force": 8.0}
+        start = {"a": 1.0, "x_dot": 0.5}
+
+        def observe(self, after, target, xp):
+            return {"x": after.x}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return after.x
+
+    envs = LagrangianVectorEnv(Slide, 2, friction=np.array([0.0, 1.0]))
+    ones = [LagrangianEnv(Slide, friction=friction) for friction in (0.0, 1.0)]
+    envs.reset(seed=3)
+    for i, env in enumerate(ones):
+        env.reset(seed=3 + i)
+    envs.action_space.seed(0)
+    for _ in range(20):
+        actions = envs.action_space.sample()
+        envs.step(actions)
+        for env, action in zip(ones, actions, strict=True):
+            env.step(action)
+        assert envs.state[1].tobytes() == ones[1].state.tobytes()
+        np.testing.assert_allclose(envs.state[0], ones[0].state, rtol=1e-12, atol=1e-12)

@@ -395,7 +395,7 @@ def simulate(scene, start, controls, dt, order, fused=True):
     return trajectory
 
 
-def in_python(name, source, *helpers, **constants):
+def in_python(name, source, *helpers, inner=False, **constants):
     """Replace `compile_function`: run the source in Python, and the recorded operations too."""
 
     def block(operations, inputs, outputs):
@@ -452,7 +452,7 @@ WITH_SUBSTEPS.append((Trolley(), [0.2, 0.1, 1.0, 9.0, -0.5, -8.0], [0.7, 0.2, 0.
 def test_unfused_bits_are_those_of_plain_numbers(scene, state, control, monkeypatch):
     assert len(state) == len(scene.state_names)
     compiled = simulate(scene, state, [control] * 3, 0.04, 10, fused=False)
-    monkeypatch.setattr(general, "compile_function", in_python)
+    monkeypatch.setattr(compiling, "compile_function", in_python)
     monkeypatch.setattr(driver, "compile_advance", advance_in_python)
     python = simulate(scene, state, [control] * 3, 0.04, 10, fused=False)
     np.testing.assert_array_equal(compiled, python.astype(float))

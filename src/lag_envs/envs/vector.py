@@ -47,7 +47,8 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     Made by ``gym.make_vec(id, num_envs=..., **parameters)``.
 
     Sub-environment i of a batch with seed s gives the same numbers, bit for bit, as the single environment
-    with seed s + i.
+    with seed s + i. (To rounding only, where a parameter is 0 in some of them and a scene has no flow of its
+    own; see docs/numerics.md.)
 
     Parameters
     ----------

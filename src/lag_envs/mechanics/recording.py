@@ -227,7 +227,8 @@ def check_signature(scene: Any, name: str) -> None:
     if any(p.kind is kinds.VAR_POSITIONAL for p in taken):
         return
     plain = [p for p in taken if p.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)]
-    if len(plain) != len(arguments) or len(plain) != len(taken):
+    swapped = displaced([p.name for p in taken], arguments)
+    if swapped or len(plain) != len(arguments) or len(plain) != len(taken):
         time = (
             "; time is not an argument: for a given motion use a prescribed coordinate"
             if {"t", "time"} & {p.name for p in taken}
@@ -236,6 +237,11 @@ def check_signature(scene: Any, name: str) -> None:
         raise FormulaError(
             f"it must be {wanted}, got ({', '.join(['self', *(p.name for p in taken)])}){time}"
         )
+
+
+def displaced(names: Sequence[str], wanted: Sequence[str]) -> bool:
+    """Return whether an argument has the name of one that belongs elsewhere."""
+    return any(name != other and name in wanted for name, other in zip(names, wanted, strict=False))
 
 
 def single_expression(value: Any, what: str = "") -> Expr:
@@ -291,6 +297,7 @@ def record_scene(scene: Any, layout: SceneLayout) -> Record:
         poses = _poses(run("poses"))
     found = Record(Energies(applied=applied, **parts), rests, poses)
     _check_controls(scene, layout, found)
+    _check_dissipation(scene, parts["dissipation"])
     return found
 
 
@@ -338,6 +345,22 @@ def _check_controls(scene: Any, layout: SceneLayout, found: Record) -> None:
                 f"{type(scene).__name__}: the control {name!r} has no effect; use u.{name} in applied or "
                 "dissipation, or name it s_ddot, s_dot or s after a prescribed coordinate s"
             )
+
+
+def _check_dissipation(scene: Any, loss: Expr) -> None:
+    """Raise a FormulaError for a dissipation function that is none: without velocities, or a force."""
+    degrees = set()
+    for monomial in loss.terms:
+        moving = [(a, n) for a, n in monomial if any(s.kind == "velocity" for s in Expr.of(a).symbols())]
+        degrees.add(sum(n if a.argument is None else 2 for a, n in moving))
+    of = f"{type(scene).__name__}.dissipation"
+    if degrees and not any(degrees):
+        raise FormulaError(f"{of} contains no velocity, so it has no effect; forces belong in applied")
+    if degrees and max(degrees) == 1:
+        raise FormulaError(
+            f"{of} is proportional to velocities, so it would push with a constant force; return half of the "
+            "power lost, such as 0.5 * b * v.x**2; forces belong in applied"
+        )
 
 
 def restrict(found: Record, values: Mapping[Atom, Expr], scene: Any, why: str) -> Record:

@@ -30,7 +30,7 @@ from lag_envs.mechanics.recording import TWIN, Values, parameter_values
 from lag_envs.scenes import picture, steps
 from lag_envs.scenes.checks import check_both
 from lag_envs.scenes.declaring import ORDER, complete, declare_scene
-from lag_envs.scenes.derivation import layout_of
+from lag_envs.scenes.derivation import layout_of, undefined
 from lag_envs.scenes.door import admit, check_class
 from lag_envs.scenes.parameters import parameter as parameter
 from lag_envs.scenes.shapes import Window
@@ -256,7 +256,10 @@ class Scene(metaclass=SceneType):
         mechanics = self.mechanics
         states, controls, shape = check_both(self, state, control)
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
-        return MotionPoint(mechanics, self._symbols(), y, u, Numeric), shape
+        try:
+            return MotionPoint(mechanics, self._symbols(), y, u, Numeric), shape
+        except ArithmeticError as error:  # from parameters alone: with arrays there are infinities
+            raise ValueError(undefined(self)) from error
 
     def _symbols(self) -> dict[Atom, Any]:
         """Return the parameters' values by symbol."""

@@ -78,14 +78,19 @@ def motion_constants_of(scene: Scene, lagged: bool = False) -> dict[str, float]:
     kept = "_cached_lagged_constants" if lagged else "_cached_constants"
     found = vars(scene).get(kept)
     if found is None:
-        found = _stepper(scene, lagged).constants(parameter_values(scene))
-        for name, value in found.items():
-            if not math.isfinite(value):
-                raise ValueError(
-                    f"these parameters make a coefficient of the motion, {name}, {value}: {scene}"
-                )
+        try:
+            found = _stepper(scene, lagged).constants(parameter_values(scene))
+        except (ArithmeticError, ValueError) as error:  # a division by 0, the root of a negative number, ...
+            raise ValueError(undefined(scene)) from error
+        if not all(map(math.isfinite, found.values())):
+            raise ValueError(undefined(scene))
         vars(scene)[kept] = found
     return found
+
+
+def undefined(scene: Scene) -> str:
+    """Return the message for parameters for which a formula has no value."""
+    return f"with these parameters a coefficient of the motion is undefined or not finite: {scene}"
 
 
 def _stepper(scene: Scene, lagged: bool) -> Any:

@@ -27,6 +27,8 @@ from lag_envs.scenes.parameters import fill_in
 
 #: A mass matrix whose smallest eigenvalue is below this, its diagonal scaled to 1, counts as singular.
 SINGULAR = 1e-13
+#: One below this makes the certificate coarse, as it bounds the inverse entry by entry.
+ILL_CONDITIONED = 1e-3
 
 #: Layouts and equations of scenes that passed the checks: by class, and by `structure_of`.
 _admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[SceneLayout, Mechanics]]] = (

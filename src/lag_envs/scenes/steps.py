@@ -35,7 +35,7 @@ from lag_envs.scenes.derivation import (
     series_order_of,
     step_argument_of,
 )
-from lag_envs.scenes.door import SINGULAR, smallest_eigenvalue
+from lag_envs.scenes.door import ILL_CONDITIONED, SINGULAR, smallest_eigenvalue
 from lag_envs.stepping.elementary import LARGEST_ANGLE
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -272,6 +272,7 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     from lag_envs.stepping.general import stepper_of
     from lag_envs.stepping.normal_forms import normal_form
 
+    motion_constants_of(scene)  # for its errors
     mechanics = mechanics_with(scene, by)
     form, numbers = normal_form(mechanics, chosen_order_of(scene)), parameter_values(scene)
     try:
@@ -343,6 +344,11 @@ def refusal(
         remedy = f"subtract whole turns from {far}"
     elif singular := _singular(scene, state, values):
         why, remedy = singular, "choose other coordinates, or end or reset the episode before"
+    elif smallest_eigenvalue(scene.mass_matrix(state, values)) < ILL_CONDITIONED:
+        remedy = (
+            "take a smaller dt, milder parameters, or coordinates that depend less on each other: the mass "
+            "matrix is nearly singular there"
+        )
     error = StepRefused(
         f"{where} was refused: from ({start}) with "
         f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}; {remedy}"

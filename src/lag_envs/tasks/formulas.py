@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.mechanics.recording import ARGUMENTS, Values, formula, parameter_names, twin
+from lag_envs.mechanics.recording import ARGUMENTS, Values, displaced, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of
 from lag_envs.scenes.door import is_own
@@ -583,12 +583,14 @@ def _check_arguments(task: Task, base: type[Task]) -> None:
             )
         taken = inspect.signature(method)
         try:
-            taken.bind(*wanted[1:])
+            fits = bool(taken.bind(*wanted[1:])) and not displaced([*taken.parameters], wanted[1:])
         except TypeError:
+            fits = False
+        if not fits:
             raise FormulaError(
                 f"{type(task).__name__}.{name} must be {name}({', '.join(wanted)}), "
                 f"got ({', '.join(['self', *taken.parameters])})"
-            ) from None
+            )
 
 
 def control_of(acting: Acting, a: Any, xp: Any) -> Any:

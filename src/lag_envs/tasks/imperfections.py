@@ -18,7 +18,7 @@ import numpy as np
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes.checks import check_lags, check_number, shown
 from lag_envs.scenes.declaring import complete
-from lag_envs.scenes.derivation import layout_of
+from lag_envs.scenes.derivation import layout_of, motion_constants_of
 from lag_envs.tasks.formulas import UNBOUNDED
 
 if TYPE_CHECKING:
@@ -413,7 +413,9 @@ class Drawn:
         """Return the task, without imperfections, that has these values of the drawn parameters."""
         given = dict(zip((d.name for d in self.draws), values, strict=True))
         try:
-            return self.task.varied(**given)
+            found = self.task.varied(**given)
+            motion_constants_of(found.scene)  # for its errors
+            return found
         except ValueError as error:
             raise ValueError(f"randomize allows {_listed(given)}, which is impossible: {error}") from error
 
