@@ -5,9 +5,9 @@ controllers that plan or were measured before, and the board's reference, and pr
 beside the numbers in use. A slow policy plays only the first episodes, and its luck is corrected by the
 reference's returns in these and in all episodes (a control variate). The reference's own number comes from
 other, independent episodes. ``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use
-stay, and an environment without any gets new ones. Its best known policy is then the best among its
-controllers and learners. A learner plays with its best seed; where that run is missing, the policy that ships
-with the package is played.
+stay until their entry is deleted from the file, and an environment without any gets new ones. Its best known
+policy is then the best among its controllers and learners. A learner plays with its best seed; where that run
+is missing, the policy that ships with the package is played.
 """
 
 from __future__ import annotations
@@ -183,6 +183,11 @@ def measure_environment(
         show_mean("privileged", fast_returns(env_id, agent, batches, size, **task.open.options))
     if not scale:
         first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
+        if not found[first]["mean"] > found["random"]["mean"]:
+            raise UserError(
+                f"{env_id}: nothing is better than random actions, so there is no scale; train a learner "
+                "first (python -m agents.train), or give the task a controller"
+            )
         scale = {"random": found["random"]["mean"], "best": found[first]["mean"]}
         scale |= {"error": found[first]["error"], "policy": first}
         scale |= {"optimum": found["optimum"]["mean"]} if task.optimum else {}

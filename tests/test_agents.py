@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from agents import bench, demo, ppo, race, report, scale, tune
 from lag_envs.controllers import make_controller
+from lag_envs.errors import UserError
 from lag_envs.evaluation.rollout import play
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
 from lag_envs.scores import known_returns, score
@@ -227,6 +228,13 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
 
 
 # --- the scale of scores ---
+
+
+def test_there_is_no_scale_unless_something_is_better_than_random_actions(monkeypatch, tmp_path):
+    monkeypatch.setattr(scale, "fast_returns", lambda *_, **__: np.ones(4))
+    monkeypatch.setattr(scale, "optima", lambda *_: np.ones(4))
+    with pytest.raises(UserError, match=rf"{incline.Brake.id}: nothing is better than random actions.*train"):
+        scale.measure_environment(incline.Brake.id, 1, True, {}, 4, 1, tmp_path)
 
 
 @pytest.mark.slow

@@ -452,6 +452,10 @@ def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
     other = Board(tmp_path / "other")
     other.add(fake_submissions.load(write(tmp_path / "another", "another")))
     assert refused(other) == "" and "pin" in wrong(other, pin=pin)
+    before = pin.read_bytes()
+    with pytest.raises(BoardError, match=r"pin.json stays as it is: this is not the board .* another FILE"):
+        audit.write_pin(other)
+    assert pin.read_bytes() == before
     assert "pin" in wrong(other, pin=tmp_path / "nowhere")
 
 

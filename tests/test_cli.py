@@ -412,6 +412,7 @@ def test_new_says_what_is_wrong(elsewhere, capsys):
     assert "must end with .py, as in swing.py" in told(capsys, "new", "swing")
     assert "one that Python can import" in told(capsys, "new", "my-scene.py")
     assert "one that Python can import" in told(capsys, "new", "class.py")
+    assert "would hide an installed module" in told(capsys, "new", "numpy.py")
     assert "there is no folder" in told(capsys, "new", "no/my_scene.py")
     (elsewhere / "folder.py").mkdir()
     assert "already exists" in told(capsys, "new", "folder.py")

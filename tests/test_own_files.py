@@ -157,6 +157,36 @@ def test_what_is_neither_an_id_nor_a_file(command, capsys, tmp_path):
         assert "did you mean PivotedBar-v0" in told(capsys, command, "PivotdBar-v0")
 
 
+def test_report_takes_no_id_for_a_folder(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("PivotedBr-v0", "ball_on_beam:BallOnBeam-v0"):
+        assert f"{name} is no FILE, and looks like an id" in told(capsys, "report", name, "--quick")
+    assert "there is no section ''" in told(capsys, "report", "--quick", "--sections", "")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["info", "play", "bench", "watch", "order"])
+def test_ids_that_no_task_of_a_file_may_have(command, write, capsys):
+    for id, message in (
+        ("PivotedBar-v0", "the id 'PivotedBar-v0' is that of an environment of this package; choose another"),
+        ("Swing Up", "mine.py: Malformed environment ID: Swing Up"),
+    ):
+        text = SCENE + TASK.replace("    scene = Swing", f"    id = {id!r}\n    scene = Swing")
+        assert message in told(capsys, command, write(text))
+        own_files.load_module.cache_clear()
+
+
+def test_modules_in_the_current_folder(write, tmp_path, monkeypatch, capsys):
+    text = SCENE + TASK.replace("    scene = Swing", '    id = "OwnPump-v0"\n    scene = Swing')
+    write(text + "\nimport lag_envs\n\nlag_envs.register(Pump)\n", "pumping.py")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
+    assert main(["info", "pumping:OwnPump-v0"]) == 0 and "torque" in capsys.readouterr().out
+    assert "'pumping:Pump-v0'; did you mean OwnPump-v0?" in told(capsys, "info", "pumping:Pump-v0")
+    assert "'math:Pump-v0'; math registers no environment" in told(capsys, "info", "math:Pump-v0")
+    assert "No module named 'no_such'" in told(capsys, "info", "no_such:Pump-v0")
+
+
 def test_places_that_are_no_python_file(capsys, tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     assert "is not a Python file" in told(capsys, "info", str(tmp_path / "notes.txt"))

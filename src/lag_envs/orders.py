@@ -79,5 +79,8 @@ def lines(task: type[Any], times: dict[int, float], now: int) -> Sequence[str]:
     if times[now + now % 2] <= SAME * times[found]:
         advice = f"{task.__name__} is stepped by order {now}, which is as fast as any."
     else:
-        advice = f"Write `order = {found}` into {task.__name__}, which is stepped by order {now} now."
+        advice = (
+            f"Write `order = {found}` into {task.__qualname__} ({task.__module__}), which is stepped by "
+            f"order {now} now."
+        )
     return ["order  ns a step  ratio", *rows, "", advice]

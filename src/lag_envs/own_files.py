@@ -6,6 +6,7 @@ Loading a file runs its code. The leaderboard never does this.
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import sys
 import traceback
@@ -15,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from lag_envs.errors import UserError, hint
+from lag_envs.tasks import TASKS
 from lag_envs.tasks.registration import register
 
 GUIDE = "docs/tutorial.md and examples/ball_on_beam.py show how"
@@ -170,11 +172,19 @@ def one(name: str) -> type[Any]:
 
 
 def made_with_defaults(kind: type[Any], path: str) -> Any:
-    """Return a task or scene with its defaults, or raise a UserError with the fault in its formulas."""
+    """Return a task or scene with its defaults, or raise a UserError with the fault in its formulas or id."""
+    import gymnasium as gym
+    from gymnasium.envs.registration import parse_env_id
+
+    file, id = split_path(path)[0], getattr(kind, "id", "")
+    if id in TASKS:
+        raise UserError(f"{file}: the id {id!r} is that of an environment of this package; choose another")
     try:
+        if id:
+            parse_env_id(id)
         return kind()
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{split_path(path)[0]}: {error}") from error
+    except (TypeError, ValueError, gym.error.Error) as error:
+        raise UserError(f"{file}: {error}") from error
 
 
 def registered(name: str) -> list[str]:
@@ -199,11 +209,25 @@ def imported(name: str) -> str:
     import gymnasium as gym
 
     module, _, env_id = name.partition(":")
+    see_current_folder()
     try:
         importlib.import_module(module)
-        return gym.spec(env_id).id
-    except (gym.error.Error, ImportError, ValueError) as error:
+    except (ImportError, ValueError) as error:
         raise UserError(f"there is no environment {name!r}: {error}") from error
+    try:
+        return gym.spec(env_id).id
+    except (gym.error.Error, ValueError) as error:
+        own = [
+            id for id, spec in gym.registry.items() if str(spec.kwargs.get("task")).startswith(f"{module}:")
+        ]
+        told = hint(env_id, own) if own else f"{module} registers no environment"
+        raise UserError(f"there is no environment {name!r}; {told}") from error
+
+
+def see_current_folder() -> None:
+    """Let modules in the current folder be imported, after all others."""
+    if not {"", os.getcwd()} & set(sys.path):
+        sys.path.append(os.getcwd())
 
 
 def _place(kind: type[Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 from lag_envs.errors import UserError
@@ -26,6 +27,8 @@ def start(path: Path) -> Path:
         raise UserError(f"{path} already exists; choose another name, or remove it first")
     if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
         raise UserError(f"{path}: the name must be one that Python can import, such as my_scene.py")
+    if find_spec(path.stem) is not None:
+        raise UserError(f"{path}: the file would hide an installed module of this name; choose another")
     if not path.absolute().parent.is_dir():
         raise UserError(f"there is no folder {path.absolute().parent}")
     try:

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from lag_envs.benchmark.measurement import BenchmarkSettings, bench
 from lag_envs.errors import run_shown
 from lag_envs.host import ONE_THREAD
+from lag_envs.own_files import see_current_folder
 from lag_envs.workers import obey_parent, run_stoppable
 
 
@@ -27,6 +28,7 @@ def main() -> int:
     """Measure with the settings from the command line."""
     obey_parent()
     warnings.simplefilter("ignore")  # from the peers
+    see_current_folder()
     settings = BenchmarkSettings(**json.loads(sys.argv[1]))
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-settings.threads :])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def run_report(args: argparse.Namespace) -> int:
         own.subjects(file)  # errors in the file are reported before anything is measured
         names: tuple[str, ...] = (own.SECTION,)
     else:
-        names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
+        names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections is not None else SECTIONS
         for name in names:
             if name not in SECTIONS:
                 raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
@@ -79,6 +80,12 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
             f"{ids[0]} is an id, and the report measures all environments at once; name a FILE with a scene "
             "of your own, or the FOLDER to write"
         )
+    for place in folders:
+        if not Path(place).is_dir() and re.search(r":|-v\d+$", place):
+            raise UserError(
+                f"{place} is no FILE, and looks like an id: for scenes of your own name their file, as in "
+                "mine.py; a FOLDER of this name must exist already"
+            )
     if len(files) > 1 or len(folders) > 1:
         raise UserError(f"at most one FILE and one FOLDER, got {' '.join(places)}")
     if files:

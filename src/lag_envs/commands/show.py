@@ -45,7 +45,7 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE",
         help="its name, as listed by `lag-envs info ID` or on the board; a submission's folder; or a model"
         " of Stable-Baselines3 (a zip, or the folder of its training), whose code is run (default: the policy"
-        " that comes with the package)",
+        " that comes with the package, or zero)",
     )
     parser.add_argument(
         "--episodes",

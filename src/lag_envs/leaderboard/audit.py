@@ -157,15 +157,22 @@ def pin_of(log: bytes) -> Pin:
     return Pin(board=first, lines=log.count(b"\n"), head=hashlib.sha256(log).hexdigest())
 
 
-def write_pin(board: Board, file: Path) -> Pin:
-    """Write a file that pins a board's log as it is; raise a BoardError unless the board is sound."""
+def write_pin(board: Board, file: Path | None = None) -> Pin:
+    """Write a file that pins a board's log as it is; raise a BoardError unless the board is sound.
+
+    Without a file, the package's own pin is written, if the log continues what it pins.
+    """
     sound(board)
     log = read_log(board.log)
+    if file is None and PIN.exists():
+        found = _pinned(board, log, None)
+        if told := [*found.wrong, *([found.open] if found.open else [])]:
+            raise BoardError(f"{PIN} stays as it is: {'; '.join(told)}; name another FILE")
     log = log[: log.rfind(b"\n") + 1]
     if not log:
         raise BoardError(f"{board.log} is empty; there is nothing to pin")
     pin = pin_of(log)
-    write_file(file, json.dumps(pin.model_dump(), indent=2) + "\n")
+    write_file(file or PIN, json.dumps(pin.model_dump(), indent=2) + "\n")
     return pin
 
 

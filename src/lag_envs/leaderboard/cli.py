@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lag_envs.errors import hint
 from lag_envs.leaderboard.board import DEFAULT, Board
 from lag_envs.leaderboard.log import (
     COMMIT,
@@ -127,7 +128,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one = action(
         "open",
         "open boards for environments that have none; otherwise begin the next protocol: freeze the scale as "
-        "it is now, and verify everything again under it",
+        "it is now; the next nonce verifies everything again under it",
         _open,
     )
     one = action("build", "write the page", _build)
@@ -190,6 +191,8 @@ def _add(args: argparse.Namespace) -> int:
         # If the same command was interrupted before, the nonce is already published.
         if any(not args.folders or e.id in added for e in waiting):
             _publish(board, args.nonce, args.source)
+    if not (args.folders or board.read().waiting()):
+        print("nothing is pending")
     return 1 if _finish(board, args) + failed else 0
 
 
@@ -219,13 +222,10 @@ def _publish(board: Board, value: str | None, source: str) -> None:
 
 
 def _open(args: argparse.Namespace) -> int:
-    board = Board(args.board)
-    there = board.exists()
-    before = board.read() if there else BoardState()
+    board = _existing(args)
+    before = board.read()
     number, after = board.open(), board.read()
     waiting = len(after.waiting())
-    if not there:
-        print(f"{board.folder} is a new board")
     if number == before.number and number in before.protocols:
         old = before.protocols[number].scales
         print("\n".join(env_id for env_id in after.protocols[number].scales if env_id not in old))
@@ -266,8 +266,8 @@ def _list(args: argparse.Namespace) -> int:
     if args.env is not None:
         boards = [b for b in boards if b["id"] == args.env]
         if not boards:
-            known = ", ".join(sorted({entry.env for entry in state.entries.values()}))
-            raise BoardError(f"there is no board named {args.env!r}; there are {known}")
+            known = sorted({entry.env for entry in state.entries.values()})
+            raise BoardError(f"there is no board named {args.env!r}; {hint(args.env, known)}")
     for number, found in enumerate(boards):
         frozen = ", frozen" if found["frozen"] else ""
         print("\n" * (number > 0) + f"{found['id']}, protocol {found['protocol']}{frozen}")
@@ -408,9 +408,8 @@ def _audit(args: argparse.Namespace) -> int:
 def _pin(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.audit import PIN, write_pin
 
-    file = args.file or PIN
-    pin = write_pin(_existing(args), file)
-    print(f"{file}: {pin.lines} lines, head {pin.head}")
+    pin = write_pin(_existing(args), args.file)
+    print(f"{args.file or PIN}: {pin.lines} lines, head {pin.head}")
     return 0
 
 

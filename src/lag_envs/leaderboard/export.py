@@ -83,6 +83,8 @@ def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
         if path.is_file():
             found.append(Source(path, normalise[i] if normalise else None))
             continue
+        if not path.exists():
+            raise ExportError(f"there is no {path}")
         folders = [path] if (path / MODEL).exists() else sorted(f.parent for f in path.glob(f"*/{MODEL}"))
         if not folders:
             raise ExportError(f"{path} is neither a model nor a folder with {MODEL} in it or one level below")
