@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from tqdm import tqdm
 
 from lag_envs import store
 from lag_envs.leaderboard.log import BoardError
@@ -167,7 +168,7 @@ def render(
     parts = "\n".join((STATIC / f"{name}.js").read_text("utf-8") for name in ("episode", "drive"))
     drive = keep("drive", "js", f'"use strict";\n(() => {{\n{parts}}})();\n')
     boards, taken = [], {"index"}
-    for given in data["environments"]:
+    for given in tqdm(data["environments"], "drawing", unit=" environments", disable=None, leave=False):
         scenery = Scenery(str(given["id"]))
         board = _board(_clean(given), data["protocol"], scenery)
         board["page"] = _unused(board["page"], taken)
