@@ -336,7 +336,7 @@ def test_cold_start_times_empty_and_filled_caches(monkeypatch):
     assert caches[2:] == [caches[0]] * 3
 
 
-def test_cold_start_shows_where_the_time_goes(tmp_path, capsys):
+def test_cold_start_shows_where_the_time_goes(tmp_path):
     start = time.perf_counter()
     stages = cold_start.cold_start(ID, str(tmp_path))
     assert len(stages) == len(cold_start.STAGES)

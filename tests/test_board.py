@@ -153,7 +153,7 @@ def test_changed_results_are_noticed(board):
         board_data(board)
 
 
-def test_files_that_change_while_they_are_copied(board, monkeypatch):
+def test_files_that_change_while_they_are_copied(board):
     folder = write(board.folder.parent / "changing")
     submission = fake_submissions.load(folder)
     (folder / "policy_0.safetensors").write_bytes(b"others")

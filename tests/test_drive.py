@@ -238,7 +238,7 @@ PLACE = """(() => {
 })()"""
 
 
-def test_by_pointer_and_by_touch(drive, browsing):
+def test_by_pointer_and_by_touch(drive):
     page = drive(incline.Tilt.id, hash="#seed=3")
     page.evaluate("document.querySelector('.stage').scrollIntoView()")
     box = page.evaluate(PLACE)

@@ -579,7 +579,7 @@ def test_subnormal_numbers_are_zero(tmp_path):
     assert affine(x, np.array([[1e300], [2.0]]), np.zeros(1)).item() == 2.0
 
 
-def test_copies_of_one_policy_are_refused(tmp_path, nets):
+def test_copies_of_one_policy_are_refused(nets):
     """However their files are padded."""
     content = (nets / "policy_0.safetensors").read_bytes()
     size = int.from_bytes(content[:8], "little")

@@ -161,7 +161,7 @@ def test_every_environment(env_id):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", own_tasks.TASKS, ids=lambda task: task.id)
-def test_tasks_of_ones_own(task, monkeypatch):
+def test_tasks_of_ones_own(task):
     spec = lag_envs.register(task)
     keywords = {"observation_noise": 0.1, "observation_delay": 0.07, "push": (5.0, 0.1)}
     if task.action:

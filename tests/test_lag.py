@@ -518,7 +518,7 @@ def test_what_overruns_its_guard_is_clipped_in_the_observation():
 
 
 @pytest.mark.slow
-def test_one_control_of_several_lags(monkeypatch):
+def test_one_control_of_several_lags():
     spec = lag_envs.register(own_tasks.Deliver)
     _, envs = played(spec, 3, 60, lag={"pull": 0.05}, action_delay=0.013)
     assert envs.unwrapped.order == general.usual_order(0.05)

@@ -258,7 +258,7 @@ def test_the_leaderboard_runs_no_file_of_anybody():
 # --- bench ---
 
 
-def test_bench_takes_tasks_of_a_file(monkeypatch, capsys, tmp_path):
+def test_bench_takes_tasks_of_a_file(monkeypatch):
     monkeypatch.setattr(contestants, "PEERS", [])
     ids = tuple(own_files.registered(SEVERAL))
     assert ids == ("OwnCrane-v0", "OwnSwitched-v0", "OwnDrift-v0")

@@ -378,7 +378,7 @@ def test_settings_of_another_kind_are_refused():
         ppo.Settings.of(good)
 
 
-def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
+def test_without_an_end_or_a_control_there_is_nothing_to_learn():
     settings = ppo.Settings.of(zoo_hyperparameters(ppo.NAME, ENV) | SHORT)
     lag_envs.register(pivoted_bar.SwingUpFree, id="OwnEndless-v0", duration=float("inf"))
     with pytest.raises(UserError, match="have no end; give it a duration"):

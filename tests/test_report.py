@@ -135,7 +135,7 @@ def written(tmp_path_factory):
     return folder
 
 
-def test_everything_is_written(written, capsys):
+def test_everything_is_written(written):
     found = json.loads((written / "report.json").read_text(encoding="utf-8"))
     assert found["complete"] and found["settings"]["date"] == "2026-01-02"
     assert len(found["sections"][dummy_section.SECTION]["rows"]) == 5

@@ -167,7 +167,7 @@ def summary(tmp_path):
     return json.loads((tmp_path / results.SUMMARY).read_text())
 
 
-def test_command_measures_and_resumes(command, tmp_path, monkeypatch):
+def test_command_measures_and_resumes(command, tmp_path):
     folders = [leave_run(tmp_path / "runs", seed) for seed in (0, 1, 10)]
     status, output = command("--envs", ENV)
     assert status == 0 and "12 measurements, 0 of them made before" in output

@@ -430,7 +430,7 @@ def advance_in_python(record, tolerance=TOLERANCE, fused=False):
         lane = StepProgress(q, v, *rows[layout.status : layout.span])
         dt = rows[layout.span]
         after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
-        rows[layout.q : layout.span] = [*after.q, *after.v, after.status, after.left, after.wish]
+        rows[layout.q : layout.span] = [*after.q, *after.v, after.attempts, after.left, after.wish]
         for row, bound in enumerate(bounds, layout.bounds):
             rows[row] += bound
         return not after.left > 0.0

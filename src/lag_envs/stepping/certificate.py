@@ -74,7 +74,7 @@ class Certificate:
         self._all = {slot: t.add(x, self._size(slot, t.index(0))) for slot, x in self._later.items()}
         self._largest = self._largest_of([self._all[self._series.slot_of["v", i]] for i in range(n)])
         self._sizes = [t.mul(self._largest, per) for per in self._per_root]
-        self._rest = [t.mul(self._tolerance, size) for size in self._sizes]
+        self._allowed = [t.mul(self._tolerance, size) for size in self._sizes]
         self._tails: dict[int, Any] = {}
         for i in self._series.live:
             self._tails[i] = self._tail(i)
@@ -103,8 +103,8 @@ class Certificate:
         for new, g in zip(again(guess), guess, strict=True):
             passed = t.both(passed, t.less(new, g))
         self._bounds = [t.mul(self._per_next, g) for g in guess]
-        for bound, rest in zip(self._bounds, self._rest, strict=True):
-            passed = t.both(passed, t.less(bound, rest))
+        for bound, allowed in zip(self._bounds, self._allowed, strict=True):
+            passed = t.both(passed, t.less(bound, allowed))
         if part is not None:
             allowed = t.mul(t.number(PART_TOLERANCES), self._tolerance)
             own = t.mul(allowed, self._largest_of(self._sums(part)))
@@ -240,7 +240,7 @@ class Certificate:
         op, args = node.op, node.args
         if op in ("place", "velocity"):
             slot = series.slot_of["v", node.index]
-            tail = t.add(self._powered(self._size(slot, self._order)), self._rest[node.index])
+            tail = t.add(self._powered(self._size(slot, self._order)), self._allowed[node.index])
             return tail if op == "velocity" else self._integrated(slot, tail)
         if op == "polynomial":
             return t.number(0.0)

@@ -71,10 +71,10 @@ def _advance_block(memory, base, count, order):  # type: ignore[no-untyped-def]
     over = 1
     for first in range(0, count, LANES):
         over &= attempt(memory, base + first, order, tolerance)
-    return 0 if over else rest(memory, base, count, order)
+    return 0 if over else unfinished(memory, base, count, order)
 
 
-def _rest(memory, base, count, order):  # type: ignore[no-untyped-def]
+def _unfinished(memory, base, count, order):  # type: ignore[no-untyped-def]
     """Continue with the lanes that are not done, side by side; return how many were refused."""
     rows = memory[base + bounds * BLOCK :]  # the last row has the lanes' numbers
     going = refused = 0
@@ -163,25 +163,25 @@ def compile_advance_block(
     width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
     attempt = compile_attempt(record, width, fused)
-    rest = compile_python("rest", _rest, attempt, **numbers)
-    return compile_python("advance_block", _advance_block, attempt, rest, **numbers)
+    unfinished = compile_python("unfinished", _unfinished, attempt, **numbers)
+    return compile_python("advance_block", _advance_block, attempt, unfinished, **numbers)
 
 
-def _enough(length, dt, rest, order):  # type: ignore[no-untyped-def]
+def _enough(length, dt, left_out, order):  # type: ignore[no-untyped-def]
     """Return the length of a substep with which derivatives leave out little enough, infinity if they do.
 
     The certificate does not cover derivatives: at rest a series has no terms, while those of its derivatives
-    may be large. `rest` estimates what they leave out, relative to themselves, from their last terms. All
+    may be large. `left_out` estimates what they leave out, relative to themselves, from their last terms. All
     substeps of a step `dt` together may leave out `COMPLETE`, or each as much as it is rounded.
     """
-    if not (rest > ROUNDED and rest * dt > COMPLETE * length) or length < SHORT * dt:
+    if not (left_out > ROUNDED and left_out * dt > COMPLETE * length) or length < SHORT * dt:
         return np.inf
-    return next_length(length, dt, rest, order)
+    return next_length(length, dt, left_out, order)
 
 
-def _next_length(length, dt, rest, order):  # type: ignore[no-untyped-def]
+def _next_length(length, dt, left_out, order):  # type: ignore[no-untyped-def]
     """Return the length of a substep with which derivatives leave out just little enough, see `_enough`."""
-    share = max(COMPLETE * length / dt, ROUNDED) / max(rest, 1e-300)
+    share = max(COMPLETE * length / dt, ROUNDED) / max(left_out, 1e-300)
     return length * min(4.0, max(0.05, 0.9 * share ** (1.0 / (order - 1))))
 
 
@@ -211,10 +211,10 @@ def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-u
             slopes[status] = dt - before
             slopes[status + 1] = used
             tangent(slopes, 0, order)
-            rest = 0.0
+            left_out = 0.0
             for i in range(width):
-                rest = max(rest, slopes[behind + i] / max(sizes[i], slopes[behind + width + i]))
-            enough = enough_of(used, dt, rest, order)
+                left_out = max(left_out, slopes[behind + i] / max(sizes[i], slopes[behind + width + i]))
+            enough = enough_of(used, dt, left_out, order)
             if enough < np.inf:
                 rows[left], rows[wish], longest = before, enough, enough
                 for i in range(2 * n):
@@ -227,7 +227,7 @@ def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-u
                 for i in range(width):
                     sizes[i] = max(sizes[i], slopes[behind + width + i])
                 if longest < dt:  # what needed short substeps may be over
-                    longest = max(longest, next_length(used, dt, rest, order))
+                    longest = max(longest, next_length(used, dt, left_out, order))
         if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
             return -np.int64(rows[status])
     return np.int64(rows[status])
@@ -288,7 +288,7 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
     cotangents of places, velocities and sources. `by_end` holds the derivatives of places and velocities with
     respect to the state, followed by `direct`.
 
-    Unfinished lanes are moved together, as in `_rest`. The substep that ends a step usually goes backwards at
+    Lanes are moved together as in `_unfinished`. The substep that ends a step usually goes backwards at
     once, using the series just expanded. All other substeps are stored, round by round, and go backwards
     afterwards, last round first, again many lanes together.
     """

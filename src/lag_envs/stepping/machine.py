@@ -394,7 +394,7 @@ def _write(
     for i in range(n):
         write(layout.q + i, lane.q[i])
         write(layout.v + i, lane.v[i])
-    write(layout.status, lane.status)
+    write(layout.status, lane.attempts)
     write(layout.left, lane.left)
     write(layout.wish, lane.wish)
     if lanes == 1:

@@ -426,7 +426,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
                     P[k + 1] = p / (k + 1)
                     Q[k + 1] = -q / (k + 1)
         if slopes.shape[1] > 0:
-            slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, i * h, gamma, delta, ramp, order)
+            slow_slopes(slopes, V, P, Q, c, s, g, h, i * h, gamma, delta, ramp, order)
         w = angle = 0.0
         for k in range(order, -1, -1):
             w += V[k]
@@ -442,7 +442,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
     return theta + turned, (w + (drift + slope)) / h, c, s
 
 
-def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
+def _slow_slopes(slopes, V, P, Q, c, s, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
     """Carry derivatives over a substep along the slow manifold: the derivative of `_slow_motion`."""
     drift = (delta + ramp * elapsed - ramp / gamma) / gamma * h
     slope = ramp / gamma * h * h
@@ -478,7 +478,7 @@ def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp,
         slopes[1, column] = speed / h
 
 
-def _no_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
+def _no_slopes(slopes, V, P, Q, c, s, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
     """Carry no derivatives: what a plain step compiles in place of `_slow_slopes`."""
 
 

@@ -97,7 +97,7 @@ class StepProgress(NamedTuple):
     ----------
     q, v : sequence of number
         Places and velocities.
-    status : number
+    attempts : number
         Number of attempts so far.
     left : number
         What is left of the step [s]; 0 where it is done.
@@ -107,7 +107,7 @@ class StepProgress(NamedTuple):
 
     q: Sequence
     v: Sequence
-    status: Any
+    attempts: Any
     left: Any
     wish: Any
 
@@ -611,7 +611,7 @@ class Series:
         after = StepProgress(
             [t.select(done, x, before) for x, before in zip(q, lane.q, strict=True)],
             [t.select(done, x, before) for x, before in zip(v, lane.v, strict=True)],
-            t.add(lane.status, t.select(wanted, t.number(1.0), zero)),
+            t.add(lane.attempts, t.select(wanted, t.number(1.0), zero)),
             left,
             t.select(done, longer, tried),
         )
