@@ -33,6 +33,16 @@ Load = Callable[[str, torch.device, bool], Launch]
 ENDLESS = 2**62
 
 
+def made_vector(task: str | type[Task], num_envs: int, cannot: str, **options: Any) -> LagrangianVectorEnv:
+    """Return the vector environment of an id or a task; for one of another package raise a ValueError."""
+    if not isinstance(task, str):
+        return LagrangianVectorEnv(task, num_envs, **options)
+    made = gym.make_vec(task, num_envs, **options).unwrapped
+    if not isinstance(made, LagrangianVectorEnv):
+        raise ValueError(f"{task} {cannot}: it is not an environment of this package")
+    return made
+
+
 class DeviceEnvs:
     """Environments on a GPU.
 
@@ -77,15 +87,8 @@ class DeviceEnvs:
                     f"on a GPU all environments have the same parameters: give {option} one value, "
                     "or make one TorchVectorEnv for each"
                 )
-        sample = (
-            gym.make_vec(task, 1, **options).unwrapped
-            if isinstance(task, str)
-            else LagrangianVectorEnv(task, 1, **options)
-        )
-        if not isinstance(sample, LagrangianVectorEnv):
-            raise ValueError(f"{name} cannot be on a GPU: it is not an environment of this package")
         #: One environment on the CPU, which provides task, spaces and modes.
-        self.sample: LagrangianVectorEnv = sample
+        self.sample = sample = made_vector(task, 1, "cannot be on a GPU", **options)
         if sample.render_mode or sample.diagnostics:
             raise ValueError("a GPU has neither render_mode nor diagnostics; leave them out")
         if sample.task.imperfections:

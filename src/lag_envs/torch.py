@@ -32,7 +32,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 import lag_envs  # noqa: F401  (registers the environments)
-from lag_envs.device import DeviceEnvs
+from lag_envs.device import DeviceEnvs, made_vector
 from lag_envs.envs.interface import start_options
 from lag_envs.envs.model import Model
 from lag_envs.envs.single import LagrangianEnv
@@ -200,13 +200,7 @@ class TorchVectorEnv:
             return
         if dtype != torch.float64:
             raise ValueError(f"on the CPU dtype must be torch.float64, got {dtype}")
-        made = (
-            gym.make_vec(task, num_envs, **options).unwrapped
-            if isinstance(task, str)
-            else LagrangianVectorEnv(task, num_envs, **options)
-        )
-        if not isinstance(made, LagrangianVectorEnv):
-            raise ValueError(f"{task} has no derivatives: it is not an environment of this package")
+        made = made_vector(task, num_envs, "has no derivatives", **options)
         if any(other is not made.task for other in made.tasks):
             raise ValueError("gradients need the same parameters in all environments; give one value for all")
         _checked_task(made.task)
@@ -295,7 +289,7 @@ class TorchVectorEnv:
         now = torch.from_numpy(self.envs.state)
         if isinstance(state, Tensor) and state.requires_grad:
             now = state.to(torch.float64)
-        self._keep(now if before is None else torch.where(torch.as_tensor(mask)[:, None], now, before))
+        self._keep(now, before, mask)
         return torch.from_numpy(observations), infos
 
     def get_state(self) -> Snapshot:
@@ -329,8 +323,7 @@ class TorchVectorEnv:
         """
         envs, before = self._on_cpu(), None if mask is None else self.state
         envs.set_state(snapshot, mask.numpy() if isinstance(mask, Tensor) else mask)
-        now = torch.from_numpy(envs.state)
-        self._keep(now if before is None else torch.where(torch.as_tensor(mask)[:, None], now, before))
+        self._keep(torch.from_numpy(envs.state), before, mask)
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Hold one control for one control interval in every environment.
@@ -383,9 +376,11 @@ class TorchVectorEnv:
         if isinstance(self.envs, LagrangianVectorEnv):
             self.envs.close()
 
-    def _keep(self, state: Tensor) -> None:
-        """Take the present states, with their history."""
+    def _keep(self, state: Tensor, before: Tensor | None = None, mask: Any = None) -> None:
+        """Take the present states, with their history; outside a mask that of the states before."""
         assert isinstance(self.envs, LagrangianVectorEnv)
+        if before is not None:
+            state = torch.where(torch.as_tensor(mask)[:, None], state, before)
         self._state, self._moment = state, (*self.envs.moment, state._version)
 
     def _on_cpu(self) -> LagrangianVectorEnv:
