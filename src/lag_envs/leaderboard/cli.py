@@ -267,7 +267,7 @@ def _list(args: argparse.Namespace) -> int:
         boards = [b for b in boards if b["id"] == args.env]
         if not boards:
             known = ", ".join(sorted({entry.env for entry in state.entries.values()}))
-            raise BoardError(f"there is no board named {args.env!r}; there are {known}")
+            raise BoardError(f"there is no board named {args.env!r}; available: {known}")
     for number, found in enumerate(boards):
         frozen = ", frozen" if found["frozen"] else ""
         print("\n" * (number > 0) + f"{found['id']}, protocol {found['protocol']}{frozen}")
