@@ -113,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = [known_name("learner", name, LEARNERS) for name in dict.fromkeys(args.learners)]
     if unfit := [name for name in names if not suits(name, task)]:
         fit = ", ".join(name for name in LEARNERS if suits(name, task))
-        raise UserError(f"{unfit[0]} does not learn actions of {args.env}'s kind; there are {fit}")
+        raise UserError(f"{unfit[0]} does not learn actions of {args.env}'s kind; available: {fit}")
     check_numbers(args, seeds=1, first_seed=0, steps=1)
     files = [file for file in (args.output, args.picture) if file]
     if len({file.resolve() for file in files}) < len(files):

@@ -16,6 +16,7 @@ from agents.analysis import Data, best_first, chances_of_improvement, summarise_
 from agents.measure import Evaluation, MeasurementJob, measure_policies
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, check_numbers, reports_errors
 from lag_envs import TASKS, __version__
+from lag_envs.errors import hint
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.host import installed_versions, machine
 from lag_envs.options import module_parser
@@ -112,7 +113,7 @@ def measure_all(
     if names is not None:
         there = {entrant.name for evaluation in evaluations for entrant in evaluation.entrants}
         if unknown := sorted(set(names) - there):
-            raise UserError(f"there is no agent {unknown[0]!r} here; there are {', '.join(sorted(there))}")
+            raise UserError(f"there is no agent {unknown[0]!r} here; {hint(unknown[0], sorted(there))}")
     found = [(evaluation, evaluation.jobs(names, episodes, changed)) for evaluation in evaluations]
     jobs = [(evaluation, job) for evaluation, own in found for job in own]
     todo = [(evaluation, job) for evaluation, job in jobs if job.key not in evaluation.returns]

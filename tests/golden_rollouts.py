@@ -1,14 +1,17 @@
 """Recorded roll-outs, to check later rewrites against.
 
-``python tests/golden_rollouts.py`` records them again, into ``golden/rollouts.npz`` and ``runs.json``. Do
-that only if an environment is meant to change: the file holds the package's results when version 0 of its
-environments was settled. Only the public interface is used here, so a rewrite need not touch this file.
+``python tests/golden_rollouts.py ID`` records those of an environment, without ids those of all, into
+``golden/rollouts.npz`` and ``runs.json``. Do that only for a new environment, or if one is meant to change:
+the file holds the package's results when version 0 of its environments was settled. The roll-outs use only
+the public interface, so a rewrite need not touch this file.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 import lag_envs
+from lag_envs.errors import hint
 from lag_envs.tasks import TASKS
 
 GOLDEN, RUNS = (Path(__file__).parent / "golden" / name for name in ("rollouts.npz", "runs.json"))
@@ -189,12 +193,22 @@ def record(chosen: dict[str, Run]) -> dict[str, np.ndarray]:
     return out
 
 
-if __name__ == "__main__":
-    # With ids, these are added to the recorded ones.
-    chosen = {
-        name: run for name, run in planned().items() if name.partition("/")[0] in (sys.argv[1:] or TASKS)
-    }
-    kept_runs = {name: run for name, run in runs().items() if sys.argv[1:] and name not in chosen}
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Record runs, and write them to the files."""
+    parser = argparse.ArgumentParser(
+        prog="python tests/golden_rollouts.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "ids", nargs="*", metavar="ID", help="record these, and keep the others as they are (default: all)"
+    )
+    ids = parser.parse_args(arguments).ids
+    for env_id in ids:
+        if env_id not in TASKS:
+            parser.error(f"there is no environment {env_id!r}; {hint(env_id, TASKS)}")
+    chosen = {name: run for name, run in planned().items() if name.partition("/")[0] in (ids or TASKS)}
+    kept_runs = {name: run for name, run in runs().items() if ids and name not in chosen}
     with np.load(GOLDEN) as file:
         kept = {key: file[key] for key in file if key.rpartition("/")[0] in kept_runs}
     recorded = kept | record(chosen)
@@ -204,3 +218,8 @@ if __name__ == "__main__":
     ends = sum(np.count_nonzero(v) for k, v in recorded.items() if k.endswith("/over"))
     calls = sum(v.size for k, v in recorded.items() if k.endswith("/over"))
     print(f"{GOLDEN}: {len(everything)} runs, {calls} calls, {ends} ends, {GOLDEN.stat().st_size:,} bytes")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

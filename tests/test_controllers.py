@@ -326,13 +326,13 @@ def test_unknown_names_get_hints():
         make_controller("PivotedBr-v0", "zero")
     with pytest.raises(ValueError, match="did you mean cascade"):
         make_controller(INCLINE, "casc")
-    with pytest.raises(ValueError, match="there are zero, random, LQR"):
+    with pytest.raises(ValueError, match="available: zero, random, LQR"):
         make_controller(BALANCE, "xyz")
     with pytest.raises(TypeError, match="unexpected keyword argument 'weight'"):
         make_controller(BALANCE, "LQR", weight=1.0)
     with pytest.raises(TypeError, match=r"an environment's id is needed.*controllers\.build takes a task"):
         make_controller(TASKS[BALANCE](), "LQR")
-    with pytest.raises(TypeError, match="a controller's name is needed, got None; there are zero, random"):
+    with pytest.raises(TypeError, match="a controller's name is needed, got None; available: zero, random"):
         make_controller(BALANCE, None)
 
 

@@ -37,6 +37,7 @@ from lag_envs.tasks.base import OF_ENVIRONMENTS
 from lag_envs.tasks.measured import measured_entry
 from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
+from tools.docs.__main__ import main as write_docs
 from tools.docs.equations import symbol
 from tools.missing import have
 
@@ -109,8 +110,9 @@ def test_docstring_has_prose_only(env_id):
 @each_id
 def test_headings(env_id, page):
     found = sections(page)
+    lacking = [name for name in environments.HEADINGS if not found.get(name, "").strip()]
+    assert not lacking, f"the docstring of {env_id}'s task has nothing under: {', '.join(lacking)}"
     assert list(found) == list(environments.HEADINGS)
-    assert all(text.strip() for text in found.values())
 
 
 @pytest.mark.parametrize("env_id", covering(PERFECT))
@@ -300,7 +302,7 @@ def test_measured_error(env_id):
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
-    assert f"is below {limit} of the state's size in nine of ten environments" in plain(readme())
+    assert f"is below {limit} of the state's size in nine of them" in plain(readme())
     assert f"error is less than {limit} of the largest value that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
@@ -375,6 +377,13 @@ def test_moving_pictures_are_small_and_move():
         assert path.stat().st_size <= pictures.LARGEST
         with Image.open(path) as picture:
             assert picture.n_frames > 20
+
+
+def test_pictures_of_an_unknown_environment_are_refused(monkeypatch, capsys):
+    monkeypatch.setattr("tools.docs.__main__.generated", None)
+    with pytest.raises(SystemExit):
+        write_docs(["--pictures", "PivotedBra-v0"])
+    assert "did you mean PivotedBar-v0" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not RENDERS, reason="pygame is not installed")

@@ -659,7 +659,7 @@ def test_unknown_parameter():
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'massa'; did you mean mass\?"):
         Good(massa=1.0)
     with pytest.raises(
-        TypeError, match="unexpected keyword argument 'qqq'; there are mass, spring, friction"
+        TypeError, match="unexpected keyword argument 'qqq'; available: mass, spring, friction"
     ):
         Good(qqq=1.0)
 

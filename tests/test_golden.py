@@ -10,7 +10,7 @@ import functools
 import numpy as np
 import pytest
 from covering import PERFECT, quick
-from golden_rollouts import GOLDEN, Roll, Run, planned, play, runs, stack
+from golden_rollouts import GOLDEN, Roll, Run, main, planned, play, runs, stack
 
 from lag_envs.tasks import TASKS
 
@@ -67,6 +67,16 @@ def assert_close(mine: np.ndarray, golden: np.ndarray, what: str, tolerance: flo
     off = np.abs(np.subtract(mine, golden, where=finite, out=np.zeros_like(golden))) - slack
     worst = np.unravel_index(np.argmax(off / size), off.shape)
     assert (off <= tolerance * size).all(), f"{what} at {worst}: {mine[worst]!r}, not {golden[worst]!r}"
+
+
+@pytest.mark.parametrize(("argument", "status"), [("--help", 0), ("PivotedBra-v0", 2)])
+def test_nothing_is_recorded_by_mistake(argument, status, monkeypatch, capsys):
+    monkeypatch.setattr("golden_rollouts.record", None)
+    with pytest.raises(SystemExit) as stopped:
+        main(["PivotedBar-v0", argument])
+    told = capsys.readouterr()
+    assert stopped.value.code == status
+    assert ("did you mean PivotedBar-v0" in told.err) if status else ("records those" in told.out)
 
 
 def test_the_file_holds_every_run():

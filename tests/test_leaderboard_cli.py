@@ -154,7 +154,7 @@ def test_mistakes(run):
         with pytest.raises(SystemExit) as left:
             run(*arguments)
         assert left.value.code == status
-    assert "there is no board in leaderboard; --board names the folder of one" in run("list")[2]
+    assert "there is no board in leaderboard. Give a board's folder with --board, or start" in run("list")[2]
     Path("torn").mkdir()
     Path("torn", "board.jsonl").write_text('{"event": "prot')
     status, _, err = run("list", "--board", "torn")
@@ -163,7 +163,7 @@ def test_mistakes(run):
     run("add", "a", "--nonce", "n")
     assert "nothing is pending" in run("nonce")[2]
     other = incline.Tilt.id
-    assert f"there is no board named {other!r}; there are PivotedBar-v0" in run("list", other)[2]
+    assert f"there is no board named {other!r}; available: PivotedBar-v0" in run("list", other)[2]
     assert "there is no 'x' on the board" in run("show", "x")[2]
     assert "published before" in run("add", write("b", "b"), "--nonce", "n")[2]
     assert "there is no protocol 3; the current one is 1" in run("show", ids()[0], "--protocol", "3")[2]
@@ -178,8 +178,8 @@ def test_mistakes(run):
 def test_a_board_that_does_not_exist(run, action):
     status, out, err = run(*action.split(), "--board", "my typo")
     assert (status, out) == (2, "")
-    assert "there is no board in my typo; --board names the folder of one, and `lag-envs" in err
-    assert "leaderboard add FOLDER --board 'my typo'` begins one there" in err
+    assert "no board in my typo. Give a board's folder with --board, or start one with `lag-envs" in err
+    assert "leaderboard add FOLDER --board 'my typo'`" in err
     Path("file").write_text("")
     assert "file is a file; a board is a folder" in run(*action.split(), "--board", "file")[2]
     assert os.listdir() == ["file"]

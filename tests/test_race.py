@@ -136,7 +136,7 @@ def test_a_disk_without_room_is_named_before_the_work(tmp_path):
         (["--seeds", "0"], "--seeds must lie between 1"),
         (
             ["--learners", "fast_ppo", "dqn"],
-            f"dqn does not learn actions of {ENV}'s kind; there are ppo, sac",
+            f"dqn does not learn actions of {ENV}'s kind; available: ppo, sac",
         ),
         (["--learners", "fast_ppp"], "did you mean fast_ppo"),
         (["--output", os.devnull], "is not a regular file"),

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from lag_envs import scenes
+from lag_envs import cli, scenes
 from lag_envs.controllers import build, controllers
+from lag_envs.errors import UserError
 from lag_envs.hyperparams import DEFAULTS, OFF_POLICY, learners
 from lag_envs.scores import share_of_privileged
-from lag_envs.tasks import TASKS, find_tasks
+from lag_envs.tasks import TASKS, find_tasks, load_task
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured_entry
 from tools.missing import COMMANDS, have, missing
@@ -71,6 +72,20 @@ def test_tasks_are_found():
 
     own = {kind for kind in below(Task) if kind.__module__.startswith("lag_envs.tasks.")}
     assert {kind.id for kind in own if "id" in vars(kind) and kind.id} == set(TASKS)
+
+
+def test_a_task_whose_file_fails_is_named_with_its_error(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "failing_task.py"
+    file.write_text("import math\n\nclass Fails:\n    steps = undefined\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(TASKS.data, "Fails-v0", "failing_task:Fails")
+    told = f"{file}, line 4: NameError: name 'undefined' is not defined"
+    with pytest.raises(UserError, match=f"^{re.escape(told)}$"):
+        TASKS["Fails-v0"]
+    assert cli.main(["list"]) == 2 and told in capsys.readouterr().err
+    for place in ("math:Fails", "no_such_module:Fails", "", None):
+        with pytest.raises(ValueError, match="task must be given as 'module:Class'"):
+            load_task(place)
 
 
 @each_task

@@ -33,7 +33,7 @@ COMMANDS = {
     "board": "lag-envs leaderboard open",
     "speed": "make bench-docs",
     "accuracy": "make report ARGS='--docs .'",
-    "picture": "python -m tools.docs --pictures",
+    "picture": "python -m tools.docs --pictures ID",
 }
 #: Items that only some environments have.
 SOME = ("plan", "value iteration", "behaviour", "real time", "board", "accuracy", "picture")

@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -64,6 +65,25 @@ def reason(error: OSError) -> str:
     return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
+def fault(path: str, file: str, error: Exception) -> str:
+    """Describe in one line what went wrong when a file was run, and where in it.
+
+    Parameters
+    ----------
+    path : str
+        The file as it is to be named.
+    file : str
+        The file as Python knows it.
+    error : Exception
+        What was raised.
+    """
+    if isinstance(error, SyntaxError) and error.filename == file:
+        return f"{path}, line {error.lineno}: {type(error).__name__}: {error.msg}"
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    where = f"{path}, line {lines[-1]}" if lines else path
+    return f"{where}: {type(error).__name__}: {error}"
+
+
 def one_line(error: BaseException, most: int = 200) -> str:
     """Return an error's kind and text as one line of so many characters at most."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:most]
@@ -112,7 +132,7 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
     close = [names[c] for c in difflib.get_close_matches(_without_version(name), names, n=3, cutoff=0.5)]
     if close:
         return f"did you mean {' or '.join(close)}?"
-    return otherwise or f"there are {', '.join(known)}"
+    return otherwise or f"available: {', '.join(known)}"
 
 
 def _without_version(name: str) -> str:

@@ -9,13 +9,12 @@ import importlib.util
 import os
 import re
 import sys
-import traceback
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from lag_envs.errors import UserError, hint
+from lag_envs.errors import UserError, fault, hint
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.registration import register
 
@@ -75,7 +74,7 @@ def load_module(path: str) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise UserError(_told(path, file, error)) from error
+        raise UserError(fault(path, str(file), error)) from error
     except SystemExit as error:
         del sys.modules[name]
         raise UserError(
@@ -95,17 +94,6 @@ def _name(file: Path) -> str:
         known = None
     taken = name in sys.modules or (known is not None and known.origin != str(file))
     return f"own_{name}" if taken else name
-
-
-def _told(path: str, file: Path, error: Exception) -> str:
-    """Describe in one line what went wrong, and where in the file."""
-    if isinstance(error, SyntaxError) and error.filename == str(file):
-        return f"{path}, line {error.lineno}: {type(error).__name__}: {error.msg}"
-    lines = [
-        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)
-    ]
-    where = f"{path}, line {lines[-1]}" if lines else path
-    return f"{where}: {type(error).__name__}: {error}"
 
 
 def tasks(path: str) -> dict[str, type[Any]]:

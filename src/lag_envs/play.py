@@ -16,7 +16,7 @@ from lag_envs.scores import in_words
 #: Keys of the controls, in order: towards the lower and the upper end.
 PAIRS = (("left", "right"), ("down", "up"), ("a", "d"), ("s", "w"))
 #: The gamepad's sticks for the same controls.
-STICKS = ("left stick, to the sides", "left stick, up and down", "right stick, to the sides", "right stick")
+STICKS = ("left stick sideways", "left stick up and down", "right stick sideways", "right stick up and down")
 #: A stick pushed less than this is at rest.
 DEAD = 0.12
 
@@ -121,12 +121,16 @@ def help_of(task: Any, space: gym.Space) -> list[str]:
     """Return the instructions for the driver."""
     names = [acting.control for acting in getattr(task.formulas, "acting", ())] or ["control"]
     ways = zip(names, keys_by_number(space), STICKS, strict=False)
-    lines = [f"{name}: keys {down} and {up}, or {stick}" for name, (down, up), stick in ways]
+    lines = [f"{name}: {_keys(down, up)}, or the {stick}" for name, (down, up), stick in ways]
     return [
         *(lines or ["there is nothing to control: just watch"]),
         "r: start over",
         "q, or close the window: end",
     ]
+
+
+def _keys(down: str, up: str) -> str:
+    return f"keys {down} and {up}" if len(down) == 1 else f"{down} and {up} arrow keys"
 
 
 def play(id: str, *, steps: int | None = None, seed: int | None = None, **options: Any) -> list[float]:

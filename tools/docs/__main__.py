@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from lag_envs.errors import hint
 from lag_envs.generated import replaced
 from lag_envs.options import module_parser
 from lag_envs.store import write_file
@@ -28,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; all by default"
     )
     args = parser.parse_args(arguments)
+    for env_id in args.pictures or ():
+        if env_id not in TASKS:
+            parser.error(f"there is no environment {env_id!r}; {hint(env_id, TASKS)}")
     for path, text in generated(ROOT).items():
         write_file(path, text)
     if args.pictures is not None:

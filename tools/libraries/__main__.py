@@ -255,7 +255,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     for name in args.names:
         if name not in known:
-            parser.error(f"there is no library {name!r}; there are {', '.join(known)}")
+            parser.error(f"there is no library {name!r}; available: {', '.join(known)}")
     HOME.mkdir(exist_ok=True)
     wheel = build_wheel()
     rows = [row for name in args.names or known for row in test(name, known[name], wheel)]

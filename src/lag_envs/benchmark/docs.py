@@ -36,8 +36,8 @@ def other_processor(report: dict[str, Any]) -> str:
     peak = next(row["steps_per_second"][1] for row in report["rows"] if row["library"] == CORE)
     found = (
         f"On another {report['machine']['processor']}, with a peak of {rate_text(peak)} multiply-adds a "
-        f"second, {len(ratios)} environments with a flow of their own, {target.num_envs:,} at once, reach "
-        f"{min(ratios.values()):.2g} to {max(ratios.values()):.2g} times CartPole's speed "
+        f"second, {len(ratios)} environments with a specialised integrator, {target.num_envs:,} at once, "
+        f"reach {min(ratios.values()):.2g} to {max(ratios.values()):.2g} times CartPole's speed "
         f"(`docs/speed-other.json`, {report['date']})."
     )
     if not below:
@@ -51,10 +51,11 @@ def other_processor(report: dict[str, Any]) -> str:
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
     """Return the files of a checkout with a report's texts, as they should be."""
     page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
+    short = claim(report, " ([speed](docs/speed.md))")
     text = replaced(page.read_text(encoding="utf-8"), "bench", speed_markdown(report))
     return {
         page: replaced(text, "fast", claim(report)),
-        readme: replaced(readme.read_text(encoding="utf-8"), "fast", claim(report)),
+        readme: replaced(readme.read_text(encoding="utf-8"), "fast", short),
     }
 
 
@@ -138,10 +139,18 @@ def _of_series(rows: list[dict[str, Any]], target: SpeedTarget) -> str:
     return ""
 
 
-def claim(report: dict[str, Any]) -> str:
-    """Return README's summary of speed: the ranges of the table, and how many targets are missed."""
+def claim(report: dict[str, Any], where: str = "") -> str:
+    """Return README's summary of speed: the ranges of the table, and how many targets are missed.
+
+    Parameters
+    ----------
+    report : dict
+        The result of `bench`.
+    where : str, optional
+        A link to the targets.
+    """
     own_rows = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
-    kinds = {"a flow of their own": True, "the general series, or imperfections": False}
+    kinds = {"a specialised integrator": True, "the general series, or imperfections": False}
     lines = [
         [name, *(_range(some, target) for target in TARGETS)]
         for name, own in kinds.items()
@@ -153,11 +162,11 @@ def claim(report: dict[str, Any]) -> str:
         for target in (*TARGETS, *SERIES_TARGETS)
         for ratio in reached_targets(report["rows"], target).values()
     ]
-    aims = f"{sum(missed)} of {len(missed)} targets are missed" if any(missed) else "All targets are met"
+    aims = f"{sum(missed)} {'is' if sum(missed) == 1 else 'are'} missed" if any(missed) else "all are met"
     return (
         "Steps per second, as multiples of those of Gymnasium's `CartPole-v1`:\n\n"
         + markdown_table(["environments with", *places], lines)
-        + f"\n\n{aims}."
+        + f"\n\nWe set {len(missed)} speed targets{where}; {aims}."
     )
 
 

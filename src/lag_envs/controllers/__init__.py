@@ -84,7 +84,7 @@ def build(task: Any, name: str, *, real_time: bool = False, **numbers: Any) -> A
     """
     found = controllers(task)
     if not isinstance(name, str):
-        raise TypeError(f"a controller's name is needed, got {name!r}; there are {', '.join(found)}")
+        raise TypeError(f"a controller's name is needed, got {name!r}; available: {', '.join(found)}")
     if name not in found:
         raise ValueError(f"{task.id or type(task).__name__} has no controller {name!r}; {hint(name, found)}")
     made = found[name]

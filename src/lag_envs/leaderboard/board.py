@@ -117,8 +117,8 @@ class Board:
         """Raise a BoardError if there is no board."""
         if not self.exists():
             raise BoardError(
-                f"there is no board in {self.folder}; --board names the folder of one, and "
-                f"`lag-envs leaderboard add FOLDER{self.option}` begins one there"
+                f"there is no board in {self.folder}. Give a board's folder with --board, or start one with "
+                f"`lag-envs leaderboard add FOLDER{self.option}`"
             )
 
     def read(self) -> BoardState:

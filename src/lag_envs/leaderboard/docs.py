@@ -93,8 +93,14 @@ def _scored(row: dict[str, Any], digits: int = 4) -> str:
 
 
 def goals() -> str:
-    """Return a table of the success criteria."""
-    texts = {env_id: TASKS[env_id].goal.text for env_id in boards()}
+    """Return a table of the success criteria.
+
+    The board's log freezes the tasks' texts as rules, so an idiom of theirs is replaced only here.
+    """
+    texts = {
+        env_id: TASKS[env_id].goal.text.replace("until it is so for good", "until it stays there")
+        for env_id in boards()
+    }
     rows = [(env_id, text[0].upper() + text[1:]) for env_id, text in texts.items()]
     return markdown_table(("environment", "success and time"), rows)
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.errors import UserError
+from lag_envs.errors import UserError, hint
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.sb3_models import ModelPolicy
@@ -416,7 +416,7 @@ def export(
     name = name or _name(sources[0], algo)
     env = env or _same("environment", [r.get("env") for r in known], "--env")
     if env not in protocol.boards():
-        raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.boards())}")
+        raise ExportError(f"there is no environment {env!r}; {hint(env, protocol.boards())}")
     if os.path.lexists(folder):
         raise ExportError(f"{folder} already exists; remove it, or choose another place")
     if seconds is None and any("wall_seconds" not in (s.result or {}) for s in sources):

@@ -4,7 +4,7 @@
 `report`               the whole report: settings, jobs, files
 `runner`               runs jobs in separate processes, keeps finished results
 `content`              the content of a section: text, tables, pictures, claims
-`page`                 HTML, Markdown, CSV and the README's tables from the measured rows
+`page`                 a report as HTML and CSV, with its figures, from the measured rows
 `oracle`, `formulas`   the exact motion of any scene, from Lagrange's equations by SymPy
 `closed_forms`         checks the oracle, and replaces it where a pendulum turns far
 `reference`            exact end states from both, shared by a report's processes

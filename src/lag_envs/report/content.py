@@ -72,5 +72,5 @@ class Content:
     tables: Sequence[Table] = ()
     pictures: Sequence[ReportFigure] = ()
     claims: Sequence[Claim] = ()
-    summary: Table | None = None  #: a small table for the README
+    summary: Table | None = None  #: a small table for docs/accuracy.md
     details: Sequence[Table] = ()  #: long tables: CSV only

@@ -54,7 +54,7 @@ PARTS = (
         "One step of the package's scenes",
         "Bar, incline and shell have dedicated steps. lag_envs is as shipped, at rounding error; a rival is "
         "given the scene's own equation and its fastest form, with the setting that just reaches an "
-        "error. Only lag_envs has a bound on its error before the step. The table names the fastest rival "
+        "error. Only lag_envs has a bound before the step. The table names the fastest rival "
         "for each error, with its time as a multiple of that of lag_envs: below 1 the rival is faster.",
         (),
     ),
@@ -212,8 +212,8 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     lines = [
         "# Accuracy",
         "",
-        "What was measured, against whom, and where others are better. It is generated from what "
-        "`lag-envs report` measured.",
+        "What was measured, how other methods compare, and where they are better. This page is generated "
+        "from the measurements of `lag-envs report`.",
         "",
         "## Error against run time",
         "",
@@ -258,22 +258,22 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
 INTRODUCTION = """\
 One control step, with its control held, is accurate to 1e-12: |error of θ| ≤ 1e-12 max(1, |θ|, |θ̇| dt) and
 |error of θ̇| ≤ 1e-12 max(1, |θ̇|, (α² + β²)^¼), where θ̈ = -α sinθ - β cosθ - γθ̇ + …. The same holds for lengths
-([numerics](numerics.md)). This covers all environments with a flow of their own, over the ordinary ranges of
-their parameters, with damping γ dt up to 1e6. At extremes, the system itself amplifies a rounding of its
-state or parameters; there the error stays within ten times that amplification. A step that would need more
-than a million substeps, or has no finite result, raises `StepRefused` and leaves the state as it was.
+([numerics](numerics.md)). This covers all environments that have a specialised integrator (driven pendulums
+and slopes), over the ordinary ranges of their parameters, with damping γ dt up to 1e6. At extremes, the
+system itself amplifies a rounding of its state or parameters; there the error stays within ten times that
+amplification. A step that would need more than a million substeps, or has no finite result, raises
+`StepRefused` and leaves the state as it was.
 
 Over many steps, errors grow as the system amplifies them. The default bar, upright and without control,
 doubles an error every 0.14 s, whatever the method.
 
 `lag-envs report` measures all results below (extras `report`, `peers`, `pinocchio`; `--quick` for a first
-look).
-It also writes a page with all rows as CSV and JSON."""
+look). It also writes a page with all rows as CSV and JSON."""
 
 FIRST = (
-    "Only lag_envs has a bound on its error that is known before or with the step. The errors of the others "
-    "were found afterwards, from exact solutions.",
-    "On the left, lag_envs is at rounding error. A coarser setting would not be faster, so it has one point.",
+    "Only lag_envs proves a bound on its truncation error, before the step or along with it. The errors of "
+    "the others were found afterwards, by comparison with exact solutions.",
+    "In the left panel lag_envs is a single point, at rounding error: a coarser setting would not be faster.",
 )
 
 

@@ -18,7 +18,8 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 
-#: README's accuracy, relative to the scales; and how many roundings of the state are allowed in addition.
+#: The accuracy that docs/accuracy.md promises, relative to the scales; and how many roundings of the state
+#: are allowed in addition.
 EXACT, ROUNDINGS = 1e-12, 10.0
 
 FULL, AMPLIFIED, REFUSED = "full accuracy", "amplified rounding", "refused with an error"

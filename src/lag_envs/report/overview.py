@@ -96,7 +96,7 @@ def overview_sentences(accuracy: dict[str, Any]) -> list[str]:
     if row["MuJoCo"] is not None:
         texts.append(
             f"A general simulator pays for its generality: at {_power(row['error'])} MuJoCo takes "
-            f"{row['MuJoCo'] / row[LAG_ENVS]:,.0f} times as long as lag_envs on the right."
+            f"{row['MuJoCo'] / row[LAG_ENVS]:,.0f} times as long as lag_envs in the right panel."
         )
     return texts
 

@@ -28,7 +28,7 @@ from lag_envs.report.runner import JobResult, Row
 
 #: An error below this many roundings, or amplified roundings, counts as no error at all.
 ROUNDINGS = 4
-#: The ones shown in README.
+#: The ones in the table of docs/accuracy.md.
 SHOWN = TARGETS[1:]
 #: Error at which lag_envs is claimed to be the fastest: the promised accuracy of a step, and what the
 #: system's amplification leaves of it over a long time.
@@ -340,7 +340,7 @@ def _all(points: Sequence[WorkPrecisionPoint]) -> Table:
 
 
 def claims(rows: Sequence[Row], points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> list[Claim]:
-    """Return the claims; whether they hold is measured, and README lists those that do not."""
+    """Return the claims; whether they hold is measured, and docs/accuracy.md lists those that do not."""
     steps = [p for p in points if p.own and p.method == LAG_ENVS and p.horizon == "one step"]
     largest = max((p.worst for p in steps), default=math.nan)
     finest = _finest(points)

@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections import UserDict
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from lag_envs.errors import UserError, fault
 from lag_envs.tasks.measured import measured_ids
 
 
@@ -32,13 +35,37 @@ def __getattr__(name: str) -> Any:
 
 
 def load_task(place: str | type[Any]) -> type[Any]:
-    """Return the task class at "module:Class", or raise a ValueError; a class is returned unchanged."""
+    """Return the task class at "module:Class"; a class is returned unchanged.
+
+    Raises
+    ------
+    UserError
+        If the module is there but fails when it is imported; it names the file.
+    ValueError
+        For any other place that leads to no class.
+    """
     if isinstance(place, type):
         return place
     try:
         return resolve(place)
-    except (AttributeError, ImportError, TypeError, ValueError) as error:
-        raise ValueError(f"task must be given as 'module:Class', got {place!r:.200}: {error}") from error
+    except Exception as error:
+        if file := _broken(place):
+            raise UserError(fault(file, file, error)) from error
+        if isinstance(error, AttributeError | ImportError | TypeError | ValueError):
+            raise ValueError(f"task must be given as 'module:Class', got {place!r:.200}: {error}") from error
+        raise
+
+
+def _broken(place: Any) -> str | None:
+    """Return the file of a place's module if there is one that could not be imported."""
+    module = str(place).partition(":")[0]
+    if module in sys.modules:
+        return None
+    try:
+        spec = find_spec(module)
+    except Exception:  # of a package around it
+        return None
+    return spec.origin if spec else None
 
 
 def resolve(place: str) -> Any:
