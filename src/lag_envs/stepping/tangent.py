@@ -166,7 +166,7 @@ class SeriesTangent:
 
         If no rate is held, all are the same for all states.
         """
-        xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
+        xp, layout, moving = VariableFunctions(), self._stepper.mechanics.layout, len(self._moving)
         ends, y, u, p = variables_of(
             *(
                 np.zeros((1, n))
@@ -193,7 +193,7 @@ class SeriesTangent:
     @property
     def _width(self) -> int:
         """Number of entries of state, controls and parameters together."""
-        return len(self._stepper._layout.state) + len(self._stepper.arguments) + len(self._by)
+        return len(self._stepper.mechanics.layout.state) + len(self._stepper.arguments) + len(self._by)
 
     @cached_property
     def _advance(self) -> Callable:
