@@ -60,17 +60,22 @@ def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
     with monkeypatch.context() as before:
         without(before, new)
         old = add(board, nonce="1")
-        shown = board_data(board, "today")["environments"][0]
-    with pytest.raises(BoardError, match="add to a board of protocol 1: success differ"):
-        add(board, "TQC")
+    with pytest.raises(BoardError, match=f"{new} has no board yet; `lag-envs leaderboard open` opens one"):
+        add(board, env=new)
+    with monkeypatch.context() as unmeasured:
+        unmeasured.setattr(scores, "known_returns", lambda id: None if id == new else known_returns(id))
+        with pytest.raises(BoardError, match=f"{new}: no scale has been measured.*agents.scale"):
+            board.open()
+    later = add(board, "TQC", nonce="1b")  # the other boards go on
+    shown = board_data(board, "today")["environments"][0]
     assert board.open() == 1 and events(board)[-1] == "opened"
     joined = board.read().protocols[1]
     assert set(joined.scales) == set(protocol.boards()) and joined.rules.model_dump() == protocol.rules()
     assert joined.references.keys() == {id for id in protocol.boards() if protocol.reference(id)}
-    assert states(board) == {old: "verified"}  # nothing is verified again
+    assert states(board) == {old: "verified", later: "verified"}  # nothing is verified again
     assert board_data(board, "today")["environments"][0] == shown
     other = add(board, env=new, nonce="2")
-    assert states(board) == {old: "verified", other: "verified"}
+    assert states(board) == {old: "verified", later: "verified", other: "verified"}
     told = next(line for line in parse(board.log.read_bytes())[0] if line.event.event == "opened")
     again = [
         *parse(board.log.read_bytes())[0],

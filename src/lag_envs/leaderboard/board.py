@@ -208,13 +208,18 @@ class Board:
         }
         found = {env_id: protocol.reference(env_id) for env_id in protocol.boards()}
         references = {env_id: reference._asdict() for env_id, reference in found.items() if reference}
-        if known and (new := {env_id: scales[env_id] for env_id in scales if env_id not in known.scales}):
-            frozen = known.rules.model_dump()
-            success = {env_id: text for env_id, text in rules["success"].items() if env_id in new}
-            if rules == frozen | {"success": frozen["success"] | success}:
+        if known and not different(known):
+            missing = [env_id for env_id in rules["success"] if env_id not in known.scales]
+            if new := {env_id: scales[env_id] for env_id in missing if env_id in scales}:
+                success = {env_id: rules["success"][env_id] for env_id in new}
                 references = {env_id: references[env_id] for env_id in new if env_id in references}
                 append("opened", number=state.number, success=success, scales=new, references=references)
                 return state.number
+            if missing := [env_id for env_id in missing if known_returns(env_id) is None]:
+                raise BoardError(
+                    f"{', '.join(missing)}: no scale has been measured, so no board can be opened; run "
+                    "`python -m agents.scale` first"
+                )
         append("protocol", number=number, rules=rules, scales=scales, references=references)
         return number
 
@@ -236,8 +241,8 @@ class Board:
         id = id_of(submission)
         with self.change() as (state, append):
             number = state.number or self._open(state, append)
-            if state.number:
-                current(state, "add to")
+            if state.number and submission.env not in current(state, "add to").scales:
+                raise BoardError(f"{submission.env} has no board yet; `lag-envs leaderboard open` opens one")
             if reason := closed(submission.env, number, number):
                 raise BoardError(f"the board of {submission.env} is frozen: {reason}")
             known = state.entries.get(id)
@@ -383,13 +388,22 @@ def current(state: BoardState, what: str) -> Protocol:
             f"the log does not state the scale of protocol {state.number}; "
             "`lag-envs leaderboard open` adds it"
         )
-    frozen = found.rules.model_dump()
-    if odd := [name for name, rule in protocol.rules().items() if rule != frozen[name]]:
+    if odd := different(found):
         raise BoardError(
             f"this version of lag_envs cannot {what} a board of protocol {state.number}: {odd[0]} differ; "
             "`lag-envs leaderboard open` begins the next protocol, under which everything is verified again"
         )
     return found
+
+
+def different(frozen: Protocol) -> list[str]:
+    """Return the names of rules that are no longer those of a protocol.
+
+    Goals of environments that have no board under it do not count.
+    """
+    then, now = frozen.rules.model_dump(), protocol.rules()
+    now["success"] = {env_id: text for env_id, text in now["success"].items() if env_id in then["success"]}
+    return [name for name, rule in now.items() if rule != then[name]]
 
 
 def others(state: BoardState, entry: BoardEntry) -> list[BoardEntry]:
