@@ -22,7 +22,7 @@ from pydantic import Field, PositiveInt
 
 from agents.learners import LearnerSettings, trainable
 from agents.ppo import Policy, network, shared_weights
-from agents.run import FIRST_FRESH_SEED, UserError
+from agents.run import UserError, first_training_seed
 from lag_envs.controllers import build
 from lag_envs.envs.stagger import stagger
 from lag_envs.tasks.base import Task
@@ -77,7 +77,7 @@ class Learner:
             raise UserError(f"{NAME} learns continuous actions, and {env_id} has discrete ones; try fast_ppo")
         self.expert = expert(task, settings.controller)
         self.envs: Any = gym.make_vec(env_id, settings.n_envs, autoreset_mode="SameStep")
-        first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
+        first = first_training_seed(seed)
         self.envs.reset(seed=first)
         self.observation, _ = stagger(self.envs, round(task.limit), first)
         self.holds: Any = None  # the controller's memory

@@ -34,7 +34,7 @@ from torch import Tensor, nn
 
 import agents
 from agents.learners import LearnerSettings, trainable
-from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
+from agents.run import CHECKPOINT, first_training_seed, reports_errors
 from agents.train import add_run_options, here, planned_runs, train_all
 from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.kernels import affine
@@ -270,7 +270,7 @@ class Learner:
         self.envs: Any = gym.make_vec(
             env_id, settings.n_envs, autoreset_mode="SameStep", max_episode_steps=limit
         )
-        first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
+        first = first_training_seed(seed)
         self.envs.reset(seed=first)
         # Episodes are under way already; what was observed before is not seen.
         self.observation = stacked(stagger(self.envs, limit, first)[0], settings.frames)

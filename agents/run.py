@@ -44,6 +44,11 @@ def fresh_seeds(episodes: int) -> range:
     return range(FIRST_FRESH_SEED, FIRST_FRESH_SEED + episodes)
 
 
+def first_training_seed(seed: int) -> int:
+    """Return the seed of a training's first environment: another training has other episodes throughout."""
+    return 1_000_000 * seed % FIRST_FRESH_SEED
+
+
 @dataclass
 class Run:
     """A run's settings and progress.

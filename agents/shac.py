@@ -31,7 +31,7 @@ from torch import nn
 
 from agents.learners import LearnerSettings, trainable
 from agents.ppo import Policy, network, shared_weights
-from agents.run import FIRST_FRESH_SEED, UserError
+from agents.run import UserError, first_training_seed
 from lag_envs.torch import Step
 
 NAME = "shac"  #: see `agents.learners.OWN`
@@ -124,9 +124,9 @@ class Learner:
             raise UserError(f"start_ranges: {env_id} has no state {unknown[0]!r}; it has {', '.join(names)}")
         self.half_widths = np.array([settings.start_ranges.get(name, 0.0) for name in names])
         self.envs: Any = gym.make_vec(env_id, settings.n_envs, autoreset_mode="Disabled").unwrapped
-        # Every seed has different episodes throughout. If windows are shorter than episodes, the first
-        # episodes end at staggered times, so that each window contains all phases.
-        self.observation, _ = self.envs.reset(seed=1_000_000 * seed % FIRST_FRESH_SEED)
+        # If windows are shorter than episodes, the first episodes end at staggered times, so that each window
+        # contains all phases.
+        self.observation, _ = self.envs.reset(seed=first_training_seed(seed))
         self.limit = max(1, round(settings.episode_share * self.task.limit))
         ages = np.arange(settings.n_envs) * self.limit // settings.n_envs
         self.left = self.limit - ages * (self.limit > settings.n_steps)
