@@ -19,7 +19,8 @@ from own_tasks import TASKS as OWN
 from lag_envs import cli, replay
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.site.build import write_page
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks import TASKS, cart_pole, cylinder_in_cylinder, incline, pivoted_bar
+from tests import board_pages
 
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
 
@@ -28,7 +29,7 @@ def test_by_keys_alone(drive, capsys):
     """Tab, arrows, Space, R and N; the command confirms the drive."""
     page = drive(incline.Tilt.id, hash="#seed=12")
     told = message(page)
-    assert "← → rate of the tilt φ\u0307 [rad/s]" in told and "Space or a tap starts" in told
+    assert "← → rate of the tilt φ\u0307 [rad/s]" in told and "Space or a click starts" in told
     page.focus("main")
     for _ in range(40):
         page.keyboard.press("Tab")
@@ -69,6 +70,22 @@ def test_by_keys_alone(drive, capsys):
     for _ in range(2):
         page.keyboard.down("Space")
     assert message(page).startswith("Paused at ")
+
+
+def test_time_waits_where_an_action_pushes(drive, tmp_path):
+    """Without a key the cart is pushed to the left: the episode would be over in a moment."""
+    id = cart_pole.CartPoleExact.id
+    write_page(board_pages.data((id,), agents=()), tmp_path)
+    page = drive(id, folder=tmp_path)
+    assert "Without a key, force is −10 N." in message(page)
+    page.keyboard.press("Space")
+    page.wait_for_timeout(400)
+    assert message(page) == "Time begins with your first key." and reading(page, "Time") == "0.00 s"
+    page.keyboard.down("d")
+    until(page, "document.querySelector('.message').textContent.startsWith('The episode has ended')")
+    page.keyboard.up("d")
+    keys = replay.read_link(link_of(page)).keys
+    assert set(replay.unpack(keys, 1)) == {(1,)}, "A D act like the arrows"
 
 
 @pytest.fixture(scope="module")

@@ -114,7 +114,7 @@ def test_agents_have_pages_and_news_are_fed():
                  "<bdi>see <code>lag-envs list</code> &lt;b&gt;</bdi>", "Ada Example", 'href="https://example.org/code"',
                  f"lag-envs watch {env_id} --agent leaderboard/submissions/{own}",
                  f'<meta property="og:title" content="iLQR · {env_id} · lag_envs leaderboard">',
-                 '<meta property="og:description" content="Controller: score 0.996, rank 1">'):  # fmt: skip
+                 "Controller: score 0.996, rank 1 of 3. "):  # fmt: skip
         assert part in page, part
     assert len(json.loads(re.findall(r'id="data">(.*?)<', page)[0])["rows"]) == 1
     preview = re.findall(r'og:image" content="https://example.org/board/(assets/[^"]+png)"', page)[0]

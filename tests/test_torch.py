@@ -1,6 +1,7 @@
 """Environments on tensors: equal to the environments, and with gradients."""
 
 import copy
+import math
 import pickle
 
 import gymnasium as gym
@@ -133,6 +134,40 @@ def test_no_gradient_through_an_end(mode):
     assert (slope[3] == 0.0).all() == (mode == "NextStep")
     (slope,) = torch.autograd.grad(rewards[2], actions)  # the last step's own reward
     assert (slope[:3] != 0.0).all()
+
+
+def test_inference_mode():
+    envs, plain = (TorchVectorEnv(IDS[0], 2) for _ in range(2))
+    for each in (envs, plain):
+        each.reset(seed=0)
+    with torch.inference_mode():
+        envs.step(torch.zeros(2, 1))
+        envs.reset(seed=1)
+        found = envs.step(torch.full((2, 1), 0.3))
+    plain.reset(seed=1)
+    assert all(
+        torch.equal(a, b) for a, b in zip(found[:4], plain.step(torch.full((2, 1), 0.3))[:4], strict=True)
+    )
+    action = torch.full((2, 1), 0.3, requires_grad=True)
+    assert envs.step(action)[1].requires_grad
+
+
+def test_masks_that_leave_no_environment_may_come_first():
+    whole = np.array([True, True])
+    envs, others = TorchVectorEnv(IDS[0], 2), TorchVectorEnv(IDS[0], 2)
+    envs.reset(seed=0, options={"reset_mask": whole})
+    others.set_state(envs.get_state(), mask=whole)
+    assert torch.equal(envs.state, others.state)
+
+
+@pytest.mark.parametrize("env_id", [pivoted_bar.SwingUp.id, slow(pivoted_bar.SwingUpFree.id)])
+def test_a_loss_that_is_not_a_number_has_no_gradient(env_id):
+    """Also where a guard chooses between two controls."""
+    envs = TorchVectorEnv(env_id, 2)
+    envs.reset(seed=0)
+    actions = torch.full((2, 1), 0.3, requires_grad=True)
+    (envs.step(actions)[1] * torch.tensor([math.nan, 1.0])).sum().backward()
+    assert actions.grad[0].isnan() and actions.grad[1].isfinite()
 
 
 def test_detach_cuts_gradients():

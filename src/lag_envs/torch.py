@@ -284,7 +284,7 @@ class TorchVectorEnv:
                     "lag_envs.torch.Step for gradients through it"
                 )
         plain = {k: v.detach().numpy() if isinstance(v, Tensor) else v for k, v in given.items()}
-        before = None if mask is None else self.state
+        before = self._before(mask)
         observations, infos = self.envs.reset(seed=seed, options=plain or None)
         now = torch.from_numpy(self.envs.state)
         if isinstance(state, Tensor) and state.requires_grad:
@@ -321,7 +321,7 @@ class TorchVectorEnv:
         TypeError, ValueError, ResetNeeded
             As `LagrangianVectorEnv.set_state` does; ValueError also on a GPU.
         """
-        envs, before = self._on_cpu(), None if mask is None else self.state
+        envs, before = self._on_cpu(), self._before(mask)
         envs.set_state(snapshot, mask.numpy() if isinstance(mask, Tensor) else mask)
         self._keep(torch.from_numpy(envs.state), before, mask)
 
@@ -376,11 +376,18 @@ class TorchVectorEnv:
         if isinstance(self.envs, LagrangianVectorEnv):
             self.envs.close()
 
+    def _before(self, mask: Any) -> Tensor | None:
+        """Return the states of which a mask leaves some; None without a mask, or before the first reset."""
+        return None if mask is None or not len(self._state) else self.state
+
     def _keep(self, state: Tensor, before: Tensor | None = None, mask: Any = None) -> None:
         """Take the present states, with their history; outside a mask that of the states before."""
         assert isinstance(self.envs, LagrangianVectorEnv)
         if before is not None:
             state = torch.where(torch.as_tensor(mask)[:, None], state, before)
+        if state.is_inference():  # such tensors could not be differentiated later
+            with torch.inference_mode(False):
+                state = state.clone()
         self._state, self._moment = state, (*self.envs.moment, state._version)
 
     def _on_cpu(self) -> LagrangianVectorEnv:

@@ -88,7 +88,8 @@ def environment_page(
     parts["Numerical Accuracy"].append(_accuracy(env_id, task, accuracy))
     parts["Known Returns"] += [_returns(env_id), _open(env_id)]
     parts["Agents"].append(_agents(env_id, task, board))
-    lines = [f"# {env_id}", prose[""], _picture(env_id), _summary(env_id, task)]
+    drive = f"[Drive it yourself, and watch its agents](../board/{env_id}.html)."
+    lines = [f"# {env_id}", prose[""], _picture(env_id), _summary(env_id, task), drive]
     for heading, texts in parts.items():
         if any(texts):
             lines += [f"## {heading}", *filter(None, texts)]
@@ -406,7 +407,7 @@ def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
             "The top of the leaderboard (0 is random actions, 1 the best policy known when the protocol "
             "began):",
             markdown_table(["Rank", "Agent", "Kind", "Score", "95 % interval"], rows),
-            f"[Drive it yourself, watch the agents, and see the whole ranking](../board/{env_id}.html). "
+            f"[The board](../board/{env_id}.html) has the whole ranking. "
             f"[Agents](../agents.md#{env_id.lower()}) has their robustness and learning curves.",
         ]
     elif task.goal:

@@ -99,7 +99,15 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Give moving pictures their stills; docs/assets/docs.js adds a button. Write minus signs."""
+    """Give moving pictures their stills; docs/assets/docs.js adds a button. Write minus signs.
+
+    Other pictures are links to their files, as small screens show them too small to read.
+    """
+    html = re.sub(
+        rf'<p>(<img (?:(?!{MOVING})[^>])*src="([^"]+)"(?:(?!{MOVING})[^>])*>)</p>',
+        r'<p><a href="\2">\1</a></p>',
+        html,
+    )
     html = re.sub(
         rf'<img [^>]*src="([^"]*{MOVING}/[^"]+)\.webp"[^>]*>',
         r'<span class="moving"><picture><source media="(prefers-reduced-motion: reduce)" '

@@ -208,9 +208,10 @@ def pulled(
         i = refused - 1
         slopes, step_refused = derivatives.jacobian(states[i : i + 1], controls[i : i + 1], dt)
         if not step_refused and np.isfinite(slopes).all():
+            large = "is too large; scale it down" if np.isfinite(cotangents[i]).all() else "is not finite"
             raise ValueError(
                 f"the gradient of row {i if rows is None else rows[i]} is not finite: its cotangent "
-                f"{cotangents[i].tolist()} is too large; scale it down"
+                f"{cotangents[i].tolist()} {large}"
             )
     _check_refused(scene, states, controls, dt, refused, rows)
     return found

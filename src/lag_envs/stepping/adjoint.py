@@ -72,7 +72,8 @@ class Differentiable(Trace):
                 continue
             for operand, amount in self._shares(node, seed):
                 if node.name in branches and node.op not in ("+", "-", "neg", "where"):
-                    amount = self.where(0.0 < self.abs(seed), amount, 0.0)
+                    # What is not taken gets exactly 0, even if its own slope is infinite. NaN is passed on.
+                    amount = self.where(self.abs(seed) <= 0.0, 0.0, amount)
                 pass_on(operand, amount)
         return [total.get(x.name, 0.0) if isinstance(x, TracedNumber) else 0.0 for x in inputs]
 

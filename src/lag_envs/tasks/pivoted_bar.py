@@ -47,7 +47,7 @@ class SwingUp(GuardedTrack, _Bar):
 
     A uniform bar hangs from a support. Move the support to and fro to swing the bar up, then keep it upright.
     With a track (`PivotedBar-v0`) the support can travel half a metre to either side. Without one
-    (`PivotedBarFree-v0`, the same class with `track=None`) its place and speed are not part of the task.
+    (`PivotedBarFree-v0`) its place and speed are not part of the task.
 
     ## Action Space
 

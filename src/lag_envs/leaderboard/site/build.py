@@ -221,7 +221,7 @@ def render(
         for row in b["rows"]:
             alone = b | {"rows": [row]}
             title = f"{row['name']} · {titled}"
-            page("agent.html", f"{row['page']}.html", board=alone, title=title, about=_about(row), **known)
+            page("agent.html", f"{row['page']}.html", board=alone, title=title, about=_about(row, b), **known)
         page("environment.html", f"{b['page']}.html", board=b, title=titled, about=b["title"], **known)
     news = sorted(
         ((b, row) for b in boards if not b["frozen"] for row in b["rows"] if row["added"]),
@@ -244,10 +244,12 @@ def _unused(name: str, taken: set[str]) -> str:
     return name
 
 
-def _about(row: Mapping[str, Any]) -> str:
-    """Return a one-sentence summary of an agent."""
-    place = "" if row["rank"] is None else f", rank {row['rank']}"
-    return f"{KINDS.get(row['kind'], row['kind'])}: score {rounded_text(row['score'])}{place}"
+def _about(row: Mapping[str, Any], board: Mapping[str, Any]) -> str:
+    """Return a summary of an agent on a board."""
+    ranked = sum(other["rank"] is not None for other in board["rows"])
+    place = "" if row["rank"] is None else f", rank {row['rank']} of {ranked}"
+    kind = KINDS.get(row["kind"], row["kind"])
+    return f"{kind}: score {rounded_text(row['score'])}{place}. {board['title']}"
 
 
 def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, Any]:

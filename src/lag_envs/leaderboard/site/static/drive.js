@@ -8,6 +8,8 @@ const PAIRS = [["ArrowLeft", "ArrowRight"], ["ArrowDown", "ArrowUp"], ["a", "d"]
 const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowDown: "↓", ArrowUp: "↑" };
 const SPOKEN = { ArrowLeft: "left arrow", ArrowRight: "right arrow", ArrowDown: "down arrow", ArrowUp: "up arrow" };
 const nameOf = (key) => NAMES[key] ?? key.toUpperCase();
+/** Keys that act as others while these drive nothing themselves. */
+const ALIASES = { a: "ArrowLeft", d: "ArrowRight", s: "ArrowDown", w: "ArrowUp" };
 
 /** Keys, pointer and gamepad as numbers per control. */
 class Hands {
@@ -21,6 +23,17 @@ class Hands {
 
   get pairs() {
     return PAIRS.slice(0, this.about.controls.length);
+  }
+
+  /** The name of an event's key. */
+  keyOf({ key }) {
+    const small = key.length === 1 ? key.toLowerCase() : key;
+    return this.pairs.flat().includes(small) ? small : ALIASES[small] ?? small;
+  }
+
+  /** Whether nobody drives: no key, pointer or stick is held. */
+  get idle() {
+    return !this.pressed.size && !this.pointer && this.readPad() === null;
   }
 
   release() {
@@ -157,6 +170,7 @@ function open(root, board, code, tools) {
       return `${keys(pair)} ${[meaning, name(about.controls[i])].filter(Boolean).join(" ")}${unit && unitOf(unit)}`;
     })
     .join(", ") + listed;
+  const short = (x) => text(x, Number.isInteger(x) ? 0 : 2);
   const words = ({ name }) => name.replace(/_/g, " ");
   const letter = (control) => (control.meaning && symbol(control.name) === words(control) ? "" : symbol(control.name));
   const how = described((pair) => pair.map(nameOf).join(" "), letter, (unit) => ` [${unit}]`);
@@ -165,15 +179,27 @@ function open(root, board, code, tools) {
     (control) => (control.meaning ? "" : words(control)),
     (unit) => ` in ${unit}`,
   );
+  const touched = matchMedia("(hover: none)").matches;
   // Without a key the first of listed actions acts, which may push too.
   const unasked = about.controls
-    .map(({ name, unit, values }, i) => (values[about.rest[i]] ? ` Without a key, ${symbol(name)} is ${text(values[about.rest[i]])} ${unit}.` : ""))
+    .map(({ name, unit, values }, i) => (values[about.rest[i]] ? ` Without a ${touched ? "touch" : "key"}, ${symbol(name)} is ${short(values[about.rest[i]])} ${unit}.` : ""))
     .join("");
+  /** Whether time waits for the first input: what acts without one would end some episodes at once. */
+  const waiting = () => Boolean(unasked && !rerunning && !me.steps && hands.idle);
   const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
-  const touched = matchMedia("(hover: none)").matches;
+  /** What a finger on the picture does. */
+  const touching = about.controls.slice(0, 2)
+    .map((control, i) => {
+      const [less, more] = [["left", "right"], ["down", "up"]][i];
+      const what = [control.meaning, letter(control)].filter(Boolean).join(" ");
+      if (!control.values.length) return `${less} and ${more} for ${what}`;
+      const value = (x) => `${short(x)} ${control.unit}`.trim();
+      return `${less} for ${value(control.values[0])}, ${more} for ${value(control.values[control.values.length - 1])} of ${what}`;
+    })
+    .join("; ") + (about.controls.every(({ values }) => values.length) ? "" : ". The farther from the middle, the stronger");
   const starting = (keys) => {
-    const by = touched ? "A tap starts. Then hold a finger on the picture: the farther from the middle, the stronger."
-      : `${keys}; or use the pointer or a gamepad. Space or a tap starts.`;
+    const by = touched ? `A tap starts. Then hold a finger on the picture: ${touching}.`
+      : `${keys}; or hold the mouse button on the picture, or use a gamepad. Space or a click starts.`;
     return `${keys ? by : "There is nothing to control here: just watch. Space or a tap starts."}${unasked}${nothing}`;
   };
   stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
@@ -379,7 +405,9 @@ function open(root, board, code, tools) {
     const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
     const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
     const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
-    tell(`${ending}: ${result}${beside}. R: ${rerunning ? "drive from this start" : "again"}, N: another start.`);
+    const next = touched ? "Start again: this start. New start: another."
+      : `R: ${rerunning ? "drive from this start" : "again"}, N: another start.`;
+    tell(`${ending}: ${result}${beside}. ${next}`);
   }
 
   function setLink(value) {
@@ -395,6 +423,12 @@ function open(root, board, code, tools) {
 
   function frame(time) {
     if (!running) return;
+    if (waiting()) {
+      before = time;
+      requestAnimationFrame(frame);
+      return;
+    }
+    if (!me.steps && !rerunning) message.textContent = "";
     left += Math.min(Math.max(time - before, 0), 100) / 1000 * Number(speed.value);
     before = time;
     // Where the steps of a frame take too long, time runs slower instead of in jerks.
@@ -419,7 +453,8 @@ function open(root, board, code, tools) {
     running = true;
     tapped = null;
     note();
-    message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive." : "";
+    message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
+      : waiting() ? `Time begins with your first ${touched ? "touch" : "key"}.` : "";
     said.textContent = message.textContent || "Driving";
     setLink("");
     before = performance.now();
@@ -642,17 +677,17 @@ function open(root, board, code, tools) {
   const acts = { " ": toggle, r: afresh, n: another };
   stage.addEventListener("keydown", (event) => {
     if (still(event) || event.target !== stage) return;
-    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    const key = hands.keyOf(event);
     const drives = hands.pairs.flat().includes(key) || (/^[1-9]$/.test(key) && about.controls.some((c) => c.values.length));
     if (drives) {
       hands.pressed.add(key);
       if (!running && !ended()) run();
     } else if (key in acts) {
       if (!event.repeat) acts[key]();
-    } else return;
+    } else if (!running || !key.startsWith("Arrow")) return; // while one drives, arrows do not scroll the page
     event.preventDefault();
   });
-  stage.addEventListener("keyup", (event) => hands.pressed.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key));
+  stage.addEventListener("keyup", (event) => hands.pressed.delete(hands.keyOf(event)));
   stage.addEventListener("blur", () => hands.release());
 
   function afresh() {
@@ -736,6 +771,13 @@ function open(root, board, code, tools) {
     run();
     stage.focus({ preventScroll: true });
   });
+  // After a choice by pointer the keys drive again; those who choose by keys stay where they are.
+  for (const select of [speed, ghostSelect, episodeSelect]) {
+    let pointed = false;
+    select.addEventListener("pointerdown", () => (pointed = true));
+    select.addEventListener("keydown", () => (pointed = false));
+    select.addEventListener("change", () => pointed && stage.focus({ preventScroll: true }));
+  }
   speed.addEventListener("change", () => (before = performance.now()));
   ghostSelect.addEventListener("change", () => {
     running = false;
@@ -752,6 +794,8 @@ function open(root, board, code, tools) {
     try {
       await navigator.clipboard.writeText(link.value);
       said.textContent = "The link was copied.";
+      copy.textContent = "Copied";
+      setTimeout(() => (copy.textContent = "Copy link"), 2000);
     } catch {
       // Pages opened from disk may not use the clipboard; the selected link can be copied by hand.
       tell("Copy the selected link.");

@@ -1227,8 +1227,8 @@
         said.textContent = "";
         driver = drive.open(find(".driver", root), board, code, tools);
         begin.hidden = true;
-        if (wanted) find(".stage", root).focus();
-        else root.scrollIntoView();
+        if (wanted) find(".stage", root).focus({ preventScroll: true });
+        find(wanted ? ".driver" : "h2", root).scrollIntoView();
       } catch (error) {
         said.textContent = String(error.message);
         begin.disabled = false;
