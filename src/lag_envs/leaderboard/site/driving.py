@@ -104,6 +104,7 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
                 "low": a.low,
                 "high": a.high,
                 "values": a.values,
+                "row": range(program.size)[rows.u][task.scene.control_names.index(a.control)],
             }
             for a in formulas.acting
         ],

@@ -507,26 +507,16 @@ function open(root, board, code, tools) {
     readOut(ghostAt(part));
   }
 
-  /** The control that a step's number asks for, within the limit that a slider may have changed. */
-  function controlOf(n, { values, low, high }) {
-    if (values.length) return values[n];
-    const limit = about.sliders.find(({ shown }) => shown);
-    const share = (n / about.levels) * (limit ? constants[limit.at] : 1);
-    return low === -high ? high * share : low + (high - low) * (0.5 + 0.5 * share);
-  }
-
   function readOut(beside) {
     const score = known && (finished(me) ? text(scoreOf(me.total)) : !ended() && "at the end") || "–";
-    const keys = rerunning ? rerunning.keys[Math.max(0, me.steps - 1)] ?? [] : mine[mine.length - 1] ?? [];
     writeList(readout, [
       ["Time", `${text(me.steps * about.dt, 2)} s`],
       ["Return", text(me.total, 2)],
       ...(ghost ? [["Ghost's return", beside ? text(beside.total, 2) : "–"]] : []),
       ["Score", untouched() ? score : "not scored"],
-      ...about.controls.map((control, i) => {
-        const { name, unit, low, high } = control;
+      ...about.controls.map(({ name, unit, low, high, row }) => {
         const digits = Math.max(-low, high) < 1 ? 3 : 2;
-        return [symbol(name), keys[i] === undefined ? "–" : `${text(controlOf(keys[i], control), digits)} ${unit}`.trim()];
+        return [symbol(name), me.steps ? `${text(me.f[row], digits)} ${unit}`.trim() : "–"];
       }),
       ...board.state_names.map((name, i) => [symbol(name), `${text(me.f[i], 2)} ${board.state_units[i] ?? ""}`]),
     ]);
