@@ -468,3 +468,13 @@ def test_the_tutorials_recording_is_as_generated_and_its_truth_is_found():
     for name, (low, high) in found.intervals.items():
         assert low < docs.ROD[name] < high
     assert math.degrees(found.noise["theta"]) == pytest.approx(docs.NOISE, rel=0.15)
+
+
+@pytest.mark.parametrize("free", [["length"], ["length", "damping"]])
+def test_noise_alone_determines_nothing(free):
+    for seed in range(4):
+        noise = 0.02 * np.random.default_rng(seed).normal(size=100)
+        states = np.column_stack([np.pi + noise, np.full(100, np.nan)])
+        with pytest.warns(FitWarning) as seen:
+            Pendulum(mass=0.12, length=0.7, damping=0.004).fit([(states, None, 0.04)], free=free)
+        assert any("the motion hardly stands out of the noise" in str(w.message) for w in seen)

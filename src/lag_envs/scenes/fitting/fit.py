@@ -241,6 +241,7 @@ def _result(
     )
     texts = [] if found.success else ["the search ended before it converged; begin closer to the truth"]
     texts += _doubts_of_parameters(fitted, parameters, best, errors, found.success)
+    texts += _doubt_of_motion(fitted, sizes)
     texts += _doubts_of_model(fitted, sizes, relaxed)
     for text in texts:
         warnings.warn(text, FitWarning, stacklevel=4)
@@ -273,6 +274,25 @@ def _doubts_of_parameters(
                     f"{fitted.correlation[i, j]:.5f}; hold one of them, or add other recordings"
                 )
     return texts
+
+
+def _doubt_of_motion(fitted: Fit, sizes: _Sizes) -> list[str]:
+    """Return a warning if the fitted motion is no larger than one that would be found in noise alone.
+
+    In N random numbers, the size of each of N/2 oscillations is distributed as chi-squared with two degrees of
+    freedom, so the largest one exceeds 2 log N + 10 in one case of three hundred.
+    """
+    strength = 0.0
+    for i in np.flatnonzero(sizes.seen):
+        columns = zip(fitted.residuals, fitted.simulated, strict=True)
+        pairs = np.concatenate([np.stack([r[:, i], s[:, i]], axis=1) for r, s in columns])
+        residuals, motion = pairs[np.isfinite(pairs).all(axis=1)].T
+        strength += len(motion) * motion.var() / max(np.mean(residuals**2), np.finfo(np.float64).tiny)
+    if strength >= 2.0 * math.log(sizes.count) + 10.0:
+        return []
+    return [
+        "the motion hardly stands out of the noise, which the estimates may follow: measure a larger motion"
+    ]
 
 
 def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
