@@ -279,8 +279,8 @@ def _doubts_of_parameters(
 def _doubt_of_motion(fitted: Fit, sizes: _Sizes) -> list[str]:
     """Return a warning if the fitted motion is no larger than one that would be found in noise alone.
 
-    In N random numbers, the size of each of N/2 oscillations is distributed as chi-squared with two degrees of
-    freedom, so the largest one exceeds 2 log N + 10 in one case of three hundred.
+    In N random numbers, the size of each of N/2 oscillations is distributed as chi-squared with two degrees
+    of freedom, so the largest one exceeds 2 log N + 10 in one case of three hundred.
     """
     strength = 0.0
     for i in np.flatnonzero(sizes.seen):
