@@ -86,13 +86,15 @@ def _sizes(scene_name, params, state, control, dt):
     return out + [max(w, push * dt) for w in state[2:]]
 
 
-def conditioning(scene_name, params, state, control, dt):
-    """Return by how much one rounding of state, parameters and control is amplified in the final state.
+def conditioning(scene_name, params, state, control, dt, include_params=False):
+    """Return by how much one rounding of the initial state is amplified in the final state.
 
     Parameters
     ----------
     scene_name, params, state, control, dt
         As for `flow`.
+    include_params : bool
+        Also count one rounding of every parameter and of the control.
 
     Returns
     -------
@@ -101,6 +103,8 @@ def conditioning(scene_name, params, state, control, dt):
     """
     digits, scene = 45, scene_of(scene_name, params)
     total = amplification(Case(scene, tuple(state), control), dt)
+    if not include_params:
+        return total
     base = reference.once(Oracle(scene), state, control, dt, digits)
 
     def count(*moved):

@@ -173,7 +173,7 @@ def one_step(case):
     plain = max(float(e) / (1e-12 * s) for e, s in zip(errors, sizes, strict=True))
     if plain < 0.1:
         return plain, plain
-    amplified = conditioning(*arguments)
+    amplified = conditioning(*arguments, include_params=True)
     shares = zip(errors, sizes, amplified, strict=True)
     return plain, max(float(e) / (EPS * a + 1e-12 * s) for e, s, a in shares)
 
@@ -495,7 +495,7 @@ def test_hard_case(name):
         took.append(time.process_time() - began)
     assert min(took) < 0.5
     arguments = kind, params, state, control, dt
-    exact, amplified = flow(*arguments, dps=30), conditioning(*arguments)
+    exact, amplified = flow(*arguments, dps=30), conditioning(*arguments, include_params=True)
     for value, truth, gain in zip(end, exact, amplified, strict=True):
         assert abs(value - truth) < 3 * EPS * max(1, gain, abs(truth))
 

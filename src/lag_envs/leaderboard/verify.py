@@ -212,10 +212,15 @@ def _plain(values: Array) -> list[Any]:
 # --- the command --------------------------------------------------------------------------------------------
 
 
-def verify_folder(folder: Path, nonce: str = "", episodes: int = protocol.EPISODES) -> dict[str, Any]:
+def verify_folder(
+    folder: Path,
+    nonce: str = "",
+    episodes: int = protocol.EPISODES,
+    progress: Callable[[int, int], Any] | None = None,
+) -> dict[str, Any]:
     """Return the result of `verify` for a folder, or ``{"refused": reason}``."""
     try:
-        return verify(load(folder), nonce, episodes)
+        return verify(load(folder), nonce, episodes, progress)
     except Refused as error:
         return {"refused": str(error)}
 
