@@ -104,9 +104,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     Other pictures are links to their files, as small screens show them too small to read.
     """
     html = re.sub(
-        rf'<p>(<img (?:(?!{MOVING})[^>])*src="([^"]+)"(?:(?!{MOVING})[^>])*>)</p>',
-        r'<p><a href="\2">\1</a></p>',
-        html,
+        rf'<p>(<img [^>]*src="((?:(?!{MOVING})[^"])+)"[^>]*>)</p>', r'<p><a href="\2">\1</a></p>', html
     )
     html = re.sub(
         rf'<img [^>]*src="([^"]*{MOVING}/[^"]+)\.webp"[^>]*>',
