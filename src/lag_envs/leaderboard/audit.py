@@ -166,7 +166,7 @@ def write_pin(board: Board, file: Path | None = None) -> Pin:
     log = read_log(board.log)
     if file is None and PIN.exists():
         found = _pinned(board, log, None)
-        if told := [*found.wrong, *([found.open] if found.open else [])]:
+        if told := [*filter(None, [*found.wrong, found.open])]:
             raise BoardError(f"{PIN} stays as it is: {'; '.join(told)}; name another FILE")
     log = log[: log.rfind(b"\n") + 1]
     if not log:
