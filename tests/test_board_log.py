@@ -209,7 +209,7 @@ def test_a_log_that_is_replaced_while_one_waits(board):
         slow(("random_moments", "200")),
         slow(("at_once", "3", "5")),
         slow(("at_once", "8", "40")),
-        ("finished_at_once", "3", "4"),
+        slow(("finished_at_once", "3", "4")),
     ],
     ids=" ".join,
 )

@@ -113,6 +113,7 @@ def test_one_distribution_brings_pygame():
     assert packages_distributions()["pygame"] == ["pygame-ce"]
 
 
+@pytest.mark.slow
 def test_no_skips_fails_what_is_skipped(tmp_path):
     """The basis of `make test-slow`: nothing is skipped silently."""
     (tmp_path / "test_it.py").write_text(

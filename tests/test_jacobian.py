@@ -175,6 +175,7 @@ def test_rows_of_a_batch():
         np.testing.assert_array_equal(b[i], one[1])
 
 
+@pytest.mark.slow
 def test_step_that_is_refused():
     # It would need so many substeps that it is refused, like the step itself.
     bar = scenes.PivotedBar(damping=0.0)

@@ -47,6 +47,7 @@ def test_far_from_ordinary_steps_are_taken_too():
     np.testing.assert_allclose(ends[0], exact, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_refusal_names_the_applied_control():
     """Not the action, which is clipped, scaled and guarded."""
 

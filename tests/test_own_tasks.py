@@ -270,7 +270,7 @@ def test_refusal_after_a_kick_that_is_no_number(kind):
         (own_tasks.Deliver, {}),
         slow(own_tasks.Deliver, {"lag": 0.05}),
         slow(pivoted_bar.SwingUp, {}),
-        (pivoted_bar.SwingUp, {"lag": 0.05}),
+        slow(pivoted_bar.SwingUp, {"lag": 0.05}),
     ],
 )
 def test_refusal_after_a_guard_that_is_no_number(kind, imperfections):

@@ -133,7 +133,7 @@ def here(count, begin=None, *given):
 
 
 @pytest.mark.parametrize(
-    ("algo", "more"), [(ppo.NAME, {}), slow(ppo.NAME, {"frames": 3}), *((name, {}) for name in OTHERS)]
+    ("algo", "more"), [(ppo.NAME, {}), slow(ppo.NAME, {"frames": 3}), *(slow(name, {}) for name in OTHERS)]
 )
 def test_a_seed_decides_everything_with_interruptions_or_without(algo, more, tmp_path):
     def made(name, seed=3):

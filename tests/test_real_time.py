@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from covering import every
 
 from agents import real_time, report
 from lag_envs.controllers import build, controllers
@@ -68,6 +69,7 @@ def test_plans_of_another_process_are_the_same():
     assert not (here == walk(quick()[0], model, STARTS, 9, restart=4)[0]).all()
 
 
+@pytest.mark.slow
 def test_each_episode_waits_for_its_own_plan():
     """The other one restarts while its next plan is in the making."""
     task = chain.SwingUp()
@@ -78,7 +80,7 @@ def test_each_episode_waits_for_its_own_plan():
     assert (together[:, :1] == alone).all()
 
 
-@pytest.mark.parametrize(("env_id", "name"), HURRIED)
+@pytest.mark.parametrize(("env_id", "name"), every(4, HURRIED))
 def test_records_tell_how_to_plan_in_real_time(env_id, name):
     task = make_task(env_id)
     agent = build(task, name, real_time=True, background=False)

@@ -170,7 +170,8 @@ def test_heyoka(name, steps, mode):
     assert worst(peers.Heyoka("Taylor", 1e-15), name, mode == "batch", steps, count=19) < 1e-13
 
 
-@pytest.mark.parametrize("mode", every(2, MODES))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
 def test_heyokas_own_step_is_what_is_timed(mode, monkeypatch):
     """The loop around heyoka's machine code has the bits of its propagate_until."""
     pytest.importorskip("heyoka")

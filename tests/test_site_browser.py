@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browsers import serious, until
-from covering import slow
+from covering import every, slow
 from toy_pendulum import Swing
 
 from lag_envs.leaderboard.board import Board
@@ -528,7 +528,7 @@ def loaded(browser, url, **network):
 SIZED = ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id)
 
 
-@pytest.mark.parametrize("name", SIZED)
+@pytest.mark.parametrize("name", every(3, SIZED))
 def test_page_is_light_before_anything_is_played(served, browser, name):
     assert loaded(browser, f"{served}/{name}.html")[0] < 300_000
 

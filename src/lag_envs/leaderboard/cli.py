@@ -442,7 +442,6 @@ def _serve(args: argparse.Namespace) -> int:
             pass
 
     with tempfile.TemporaryDirectory() as folder:
-        write_page(page_data(board), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except OverflowError as error:
@@ -452,6 +451,7 @@ def _serve(args: argparse.Namespace) -> int:
                 f"port {args.port} is already in use ({error}); --port 0 takes a free one"
             ) from error
         with server:
+            write_page(page_data(board), Path(folder))
             print(f"http://127.0.0.1:{server.server_address[1]} (Ctrl-C ends)", flush=True)
             server.serve_forever()
     return 0

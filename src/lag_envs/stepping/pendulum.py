@@ -662,7 +662,8 @@ def _tangent(values, slopes, scratch, dt, x):  # type: ignore[no-untyped-def]
         if drift:
             alpha = beta = 0.0
         delta += ramp * layer
-        slopes[7] += slopes[8] * layer
+        for column in range(slopes.shape[1]):  # a sum of rows would take Numba a second longer
+            slopes[7, column] += slopes[8, column] * layer
         slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order, slopes)
     return 0
 
