@@ -167,7 +167,7 @@ class Solution:
         self.n_state = len(self.task.scene.state_names)
         self.keep = list(problem.keep or range(self.n_state))
         self.steps = int(self.task.limit)
-        self.kick: Kick | None = self._kick if problem.pushes else None
+        self.kick: Kick | None = self._kick if self._kicks() else None
         #: The last targets, and the nodes of the axis that follows them: they last for an episode.
         self._asked: Array = np.empty(0)
         self._own: Array = np.empty((0, 0))
@@ -190,8 +190,11 @@ class Solution:
             "schema": CACHED, "env": self.env_id, "options": dict(problem.options), "target": target,
             "level": self.level, "pushes": problem.pushes, "constants": self.task.formulas.constants(),
         }  # fmt: skip
-        largest = self.task.formulas.largest
+        formulas = self.task.formulas
+        largest = formulas.largest
         actions = np.linspace(-largest, largest, problem.actions)
+        if formulas.choices:
+            actions = np.arange(formulas.choices[0], dtype=np.float64)
         step = functools.partial(self.step, target=target)
         places = grid(problem, self.level, target)
         return DynamicProgramme(places, actions, step, self.steps, self.kick, parameters)
@@ -207,10 +210,28 @@ class Solution:
         ends, rewards, ended = self.model(self.states(points), actions, target)
         return ends[:, self.keep], rewards, ended
 
+    def _kicks(self) -> bool:
+        """Return whether there are random kicks; raise a ValueError for those that `_kick` does not know."""
+        if not self.task.draws:
+            return False
+        chance, state = self.task.chance(self.problem.chance), np.array([self.task.centre])
+        ends = (
+            [self.model.kicked(state, [[share * chance], [0.9]]) for share in (1.0 - 1e-9, 1.0 + 1e-9)]
+            if self.task.draws == 2 and self.problem.pushes
+            else []
+        )
+        if not ends or (ends[0] == ends[1]).all() or (ends[1] != state).any():
+            raise ValueError(
+                f"value iteration would leave out the kicks of {self.env_id}: it takes those of two random "
+                "numbers, of which the first is below the chance of a kick and the second gives its size; "
+                "set `pushes` and `chance` in its ValueIteration"
+            )
+        return True
+
     def _kick(self, points: Array) -> tuple[Array, Array]:
         """Return the outcomes of no kick and of kicks of all sizes, with their probabilities."""
         states, pushes = self.states(points), self.problem.pushes
-        chance = self.task.chance(0.01)
+        chance = self.task.chance(self.problem.chance)
         # The first random number decides whether there is a kick, the second one its size.
         draws = [(1.0 - 1e-9, 0.5), *((0.0, (i + 0.5) / pushes) for i in range(pushes))]
         weights = np.array([1.0 - chance, *[chance / pushes] * pushes])

@@ -41,7 +41,7 @@ class Constant:
     Parameters
     ----------
     action : float or sequence of float
-        The action: in [-1, 1], for each control, or the number of a choice.
+        The action: in [-1, 1], for each control.
     """
 
     def __init__(self, action: Any) -> None:
@@ -60,9 +60,12 @@ class Constant:
         return FeedbackLaw(np.zeros((1, n)), actions, np.zeros((1, actions.size, n)), None)
 
 
-def constant(task: Task, *, action: float) -> Constant:
-    """Return the agent that always takes one action."""
-    return Constant(action)
+def constant(task: Task, *, action: Any) -> Constant | Choice:
+    """Return the agent that always takes one action; of listed actions, the one with this number."""
+    if not task.formulas.choices:
+        return Constant(action)
+    Actions(task.formulas).one(action)  # a ValueError if there is no such choice
+    return Choice(task, choice=action)
 
 
 class Feedback:
@@ -116,6 +119,10 @@ class Switch:
     """
 
     def __init__(self, task: Task, *, weights: Mapping[str, float]) -> None:
+        check_acts("Switch", task)
+        if task.formulas.actions > 1:
+            raise ValueError(f"Switch takes one control; {type(task).__name__} has several")
+        check_names("weights", weights, list(task.observation))
         self.task = task
         self.weights = np.array([weights.get(name, 0.0) for name in task.observation])
 
@@ -134,18 +141,23 @@ def do_nothing(of: gym.Env | Task) -> Constant | Choice:
 
 
 class Choice:
-    """In tasks whose actions are choices, always the choice with the smallest control.
+    """In tasks whose actions are choices, always the same choice, or a random one.
 
     Parameters
     ----------
     task : Task
         The task.
+    choice : int or sequence of int, optional
+        The choice, or one for each control; by default that with the smallest control.
     rng : Generator, optional
         Choose at random, by these random numbers.
     """
 
-    def __init__(self, task: Task, rng: np.random.Generator | None = None) -> None:
+    def __init__(
+        self, task: Task, *, choice: ArrayLike | None = None, rng: np.random.Generator | None = None
+    ) -> None:
         self.task, self.rng = task, rng
+        self.choice = np.asarray(task.rest_action if choice is None else choice, np.int64)
         self.shape = Actions(task.formulas).shape
 
     def predict(
@@ -154,7 +166,7 @@ class Choice:
         """Return the choice, for each observation."""
         shape = (*np.shape(observation)[:-1], *self.shape)
         if self.rng is None:
-            return np.broadcast_to(np.asarray(self.task.rest_action, np.int64), shape).copy(), state
+            return np.broadcast_to(self.choice, shape).copy(), state
         choices = self.task.formulas.choices
         return self.rng.integers(choices if self.shape else choices[0], size=shape), state
 
@@ -186,7 +198,7 @@ class Random:
 def at_random(task: Task, seed: int = 0) -> Random | Choice:
     """Return the agent of random actions."""
     if task.formulas.choices:
-        return Choice(task, np.random.default_rng(seed))
+        return Choice(task, rng=np.random.default_rng(seed))
     return Random(seed, task.formulas.actions, task.formulas.largest)
 
 
@@ -347,7 +359,7 @@ class ObservationDecoder:
     task : Task
         The task.
     complete : bool
-        Whether the observation has to tell the whole state.
+        Whether the observation has to tell the whole state, and the target if it is random.
 
     Raises
     ------
@@ -388,6 +400,11 @@ class ObservationDecoder:
         told[self.wrapped] = [told[[j, j + 1]].all() for _, j in self._pairs]
         if complete and not told[: self._n].all():
             raise ValueError(self._unreadable("state", np.array(task.scene.state_names)[~told[: self._n]]))
+        if complete and formulas.targets and task.fixed_target is None and not told[self._width :].all():
+            raise ValueError(
+                f"this controller reads the target from the observation, but {type(task).__name__} does not "
+                "tell it: observe every target, linearly, or fix it"
+            )
 
     def _linear(
         self, seen: Callable[[NDArray[np.float64]], list], width: int

@@ -9,7 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, check_observation
+from lag_envs.controllers.basic import (
+    Array,
+    ObservationDecoder,
+    check_observation,
+    check_single_control,
+)
 from lag_envs.controllers.mpc import renewed
 from lag_envs.controllers.tracking import follow, recorded
 from lag_envs.envs.model import Model
@@ -37,17 +42,18 @@ class Filtered:
     ----------
     task : Task
         The task, ``env.unwrapped.task``, with one control, no targets and noise on every observation; actions
-        and observations must not be late.
+        and observations must not be late, nor controls slowed down.
     controller : controller
         Acts on observations computed from the estimate.
     drift : float
         Standard deviation that is added to the estimate in each step, as a share of the state's spread at the
-        start: an overconfident filter would ignore observations.
+        start: an overconfident filter would ignore observations. It stands for all that disturbs the motion,
+        such as kicks, pushes and action noise.
 
     Raises
     ------
     ValueError
-        For a task whose imperfections it does not model.
+        For other tasks, and for a motion that is disturbed although `drift` is 0.
 
     References
     ----------
@@ -58,11 +64,21 @@ class Filtered:
     of_one_interval = True
 
     def __init__(self, task: Task, controller: Any, *, drift: float = 0.0) -> None:
+        check_single_control("Filtered", task)
+        if task.formulas.targets:
+            raise ValueError(f"Filtered estimates states without targets; {type(task).__name__} has targets")
         found = task.imperfections
         if found is None or not all(found.observation_noise or [0.0]):
             raise ValueError("a Kalman filter needs a task with noise on every entry of the observation")
         if found.observation_delay or any(found.action_delay) or found.drawn or found.observation_every > 1:
             raise ValueError("this filter needs known parameters, and every observation on time")
+        if found.slew or any(found.lag):
+            raise ValueError("this filter needs controls that act at once: no `lag`, no `slew`")
+        if drift == 0.0 and (task.draws or any(found.action_noise) or any(found.push)):
+            raise ValueError(
+                "without drift this filter takes the motion for certain; kicks, pushes and action noise need "
+                "drift > 0"
+            )
         self.task, self.controller = task, controller
         self.read, self.model = ObservationDecoder(task), Model(task)
         self.noise = np.diag(np.square(found.observation_noise))

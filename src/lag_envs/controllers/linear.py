@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import sympy
@@ -23,6 +22,7 @@ from lag_envs.controllers.basic import (
     check_single_control,
     hold_law,
 )
+from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
@@ -40,23 +40,41 @@ def quadratic_cost(task: Task, state: Sequence[float] | Array) -> Array:
     state : sequence of float, shape (n,)
         The equilibrium without control about which to expand.
     """
-    scene = task.scene
-    x = [sympy.Symbol(name, real=True) for name in (*scene.state_names, "u")]
-    lifted: list = list(x[:-1])
-    form: Any = form_of(scene)
-    if form is not None and form.angle is not None:
-        angle = x[form.angle]
-        lifted += [sympy.cos(angle), sympy.sin(angle)]
+    scene, (acting,) = task.scene, task.formulas.acting
+    names, form = scene.state_names, form_of(scene)
+
+    def lifted(x: list) -> list:
+        angle = [] if form is None or form.angle is None else [x[form.angle]]
+        return [*x, *map(sympy.cos, angle), *map(sympy.sin, angle)]
+
+    x = [sympy.Symbol(name, real=True) for name in (*names, "u")]
+    before = [sympy.Symbol(f"{name} before", real=True) for name in names]
+    u = [x[-1] if name == acting.control else 0.0 for name in scene.control_names]
+    states, targets = (lifted(before), lifted(x[:-1])), [0.0] * task.formulas.targets
     k = SimpleNamespace(**task.formulas.constants())
-    reward = task.formulas.reward(Symbolic, lifted, lifted, x[-1:], [0.0] * task.formulas.targets, k)
-    curvature = sympy.hessian(reward, x).subs(dict(zip(x, (*state, 0.0), strict=True)))
-    return -0.5 * np.array(curvature.tolist(), np.float64)
+    try:
+        reward = sympy.sympify(task.formulas.reward(Symbolic, *states, u, targets, k))
+        curvature = sympy.hessian(reward, x).subs(dict(zip(x, (*state, 0.0), strict=True)))
+        found = -0.5 * np.array(curvature.tolist(), np.float64)
+    except (FormulaError, TypeError) as error:
+        raise ValueError(
+            f"the regulator needs a smooth reward, without branches; that of {type(task).__name__} is not "
+            "(Regulator takes weights instead)"
+        ) from error
+    if reward.free_symbols & set(before) or found[:-1, -1].any():
+        raise ValueError(
+            f"the regulator needs a reward of the state after the step and of the control, apart from each "
+            f"other; that of {type(task).__name__} is not (Regulator takes weights instead)"
+        )
+    return found
 
 
 def regulator(
     task: Task, state: Sequence[float] | Array, *, extra: Mapping[str, float] | None = None
 ) -> tuple[Array, Array]:
-    """Return K of δu = -K δx, shape (n,), and P of the cost to go δx'Pδx, near an equilibrium.
+    """Return K of δu = -K δx, shape (n,), and P of the cost δx'Pδx from here on, near an equilibrium.
+
+    That cost includes the present state's own, which the task's reward has paid already.
 
     Parameters
     ----------
@@ -74,10 +92,23 @@ def regulator(
     check_names("extra", extra or {}, names)
     for name, weight in (extra or {}).items():
         c[names.index(name), names.index(name)] += weight * task.dt / task.interval
-    a, b = task.scene.jacobian(state, 0.0, task.dt)
+    controls = list(task.scene.control_names)
+    a, b = task.scene.jacobian(state, np.zeros(len(controls)), task.dt)
+    b = b[:, [controls.index(task.formulas.acting[0].control)]]
     q, r = c[:-1, :-1], c[-1:, -1:]
-    p = solve_discrete_are(a, b, q, r)
+    p = _cost(a, b, q, r)
     return _gain(a, b, p, r)[0], p
+
+
+def _cost(a: Array, b: Array, q: Array, r: Array) -> Array:
+    """Return P of the least cost x'Px of steps Ax + Bu, each of which costs x'Qx + u'Ru."""
+    try:
+        return np.asarray(solve_discrete_are(a, b, q, r), np.float64)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            "no regulator: give a weight to every entry of the state that does not come to rest by itself, "
+            "and check that the controls can bring it there"
+        ) from error
 
 
 def _gain(a: Array, b: Array, p: Array, r: Array) -> Array:
@@ -127,7 +158,7 @@ def time_varying(
     by_action = (task.wanted(np.eye(m)) - task.wanted(np.zeros((m, m)))).T
     a, b = scene.jacobian(rest, task.wanted(np.atleast_2d(task.rest_action))[0], task.dt)
     b = b @ by_action
-    p = solve_discrete_are(a, b, q, r)
+    p = _cost(a, b, q, r)
     hold = _gain(a, b, p, r)
     gains = np.empty((len(actions), m, len(rest)))
     if len(actions):
@@ -143,10 +174,12 @@ def time_varying(
 class Regulator(FeedbackController):
     """Hold a rest by a linear-quadratic regulator of the exact control step.
 
+    It holds the same rest whatever the task's target is.
+
     Parameters
     ----------
     task : Task
-        The task, ``env.unwrapped.task``.
+        The task, ``env.unwrapped.task``; no control at all must be among its actions.
     at : mapping, optional
         Nonzero entries of the state at rest.
     weights : mapping
@@ -180,12 +213,18 @@ class Regulator(FeedbackController):
         b = b[:, columns]
         q = np.diag([weights.get(name, 0.0) for name in scene.state_names])
         r = effort * np.diag(1.0 / np.atleast_1d(task.limit_control) ** 2)
-        self.cost = solve_discrete_are(a, b, q, r)
+        self.cost = _cost(a, b, q, r)
         self.gain = _gain(a, b, self.cost, r)
 
     def _check_rest(self, task: Task) -> None:
         """Raise a ValueError if the state does not stay at rest without control."""
         scene = task.scene
+        for acting in task.formulas.acting:
+            if not acting.low <= 0.0 <= acting.high:
+                raise ValueError(
+                    f"the regulator holds a rest without control, but {acting.control} of "
+                    f"{type(task).__name__} goes from {acting.low:g} to {acting.high:g}"
+                )
         (after,) = scene.simulate(self.rest, np.zeros((1, len(scene.control_names))), task.dt)[1:]
         moved = np.abs(self.read.difference(after, self.rest))
         if moved.max() > 1e-6 * max(1.0, np.abs(self.rest).max()):

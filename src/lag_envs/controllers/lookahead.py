@@ -25,10 +25,12 @@ class Clocked(ABC):
     ----------
     task : Task
         The task, with at most one target.
+    complete : bool
+        Whether the observation has to tell the whole state, and the target if it is random.
     """
 
-    def __init__(self, task: Task) -> None:
-        self.read = ObservationDecoder(task)
+    def __init__(self, task: Task, *, complete: bool = False) -> None:
+        self.read = ObservationDecoder(task, complete=complete)
         self._chooses = bool(task.formulas.choices)
         self.largest = task.formulas.largest
         #: Advance of the clock at each `predict`: less than 1 when acting more often.

@@ -102,7 +102,8 @@ class MPC:
     holds : callable, optional
         Tells where no plan is needed, from states (n, n_state) to booleans (n,).
     seed : int
-        Seed of the guesses.
+        Seed of the guesses. All episodes share them, so a plan may depend on the plans before; a new agent
+        begins again.
     """
 
     def __init__(

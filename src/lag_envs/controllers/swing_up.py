@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array, check_names, remade
+from lag_envs.controllers.basic import Array, check_names, check_single_control, remade
 from lag_envs.tasks.base import Task
 
 
@@ -42,6 +42,13 @@ def easier(
         For how many of the task's steps each control is held.
     """
     kind: Any = type(task)
+    check_single_control("easier", task)
+    (acting,) = task.formulas.acting
+    if acting.low != -acting.high:
+        raise ValueError(
+            f"plans for an easier task need a control as strong in both directions; that of {kind.__name__} "
+            f"goes from {acting.low:g} to {acting.high:g}"
+        )
     (name,) = kind.action
     most = share * float(task.limit_control)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import FeedbackLaw, remade
+from lag_envs.controllers.basic import FeedbackLaw, check_continuous, remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -58,7 +58,8 @@ class Tracking(Clocked):
         rest: ArrayLike,
         hold: ArrayLike,
     ) -> None:
-        super().__init__(task)
+        check_continuous("Tracking", task)
+        super().__init__(task, complete=True)
         self.task = task
         self.states, self.actions, self.gains, self.rest, self.hold = (
             np.asarray(values, np.float64) for values in (states, actions, gains, rest, hold)

@@ -160,7 +160,13 @@ class Model:
         wanted = (n,) if count == 1 else (n, count)
         if actions.shape != wanted:
             raise ValueError(f"actions must have shape {wanted}, got {actions.shape}")
-        return states, _finite("actions", actions).reshape(n, count), targets
+        actions = _finite("actions", actions).reshape(n, count)
+        if choices := self.task.formulas.choices:
+            bad = (actions != np.floor(actions)) | (actions < 0.0) | (actions >= np.array(choices))
+            if bad.any():
+                ranges = ", ".join(f"0 to {count - 1}" for count in choices)
+                raise ValueError(f"actions must be numbers of choices, {ranges}; got {actions[bad][0]:g}")
+        return states, actions, targets
 
     def _checked_states(self, states: ArrayLike) -> Array:
         """Return states as an array of shape (n, n_state), or raise a ValueError."""

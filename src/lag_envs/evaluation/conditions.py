@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import MOST_DRAWN
 
 #: Names of the unchanged environment, and of acting ten times as often.
@@ -65,12 +67,27 @@ def often(env_id: str) -> Condition:
 
 
 def disturbances(env_id: str) -> list[Condition]:
-    """Return a condition for each of the environment's numbers off by 20 %, unknown to policies."""
+    """Return a condition for each of the environment's numbers off by 20 %, unknown to policies.
+
+    Values that the environment refuses, such as a friction beyond its range, are left out.
+    """
+    kind: Any = TASKS[env_id]
     return [
         Condition(f"{name} {sign}20 %", {name: share * value})
         for name, value in _positive(env_id).items()
         for share, sign in ((0.8, "-"), (1.2, "+"))
+        if _takes(kind, name, share * value)
     ]
+
+
+@cache
+def _takes(kind: type[Task], name: str, value: float) -> bool:
+    """Return whether a task can be made with another number."""
+    try:
+        kind(**{name: value})
+    except ValueError:
+        return False
+    return True
 
 
 def _positive(env_id: str) -> dict[str, float]:
@@ -87,14 +104,19 @@ def imperfections(env_id: str) -> list[Condition]:
     environment's numbers, the first `MOST_DRAWN` of them, drawn within 20 % in each episode. Imperfections
     that the environment already has stay as they are.
     """
-    task = TASKS[env_id]()
+    kind: Any = TASKS[env_id]
+    task = kind()
     layout = layout_of(task.scene)
     turning = {
         entry.name: 0.02 * task.examples.reach
         for entry in layout.state
         if entry.unit == "rad/s" and entry.coordinate in layout.free
     }
-    hidden = [*_positive(env_id)][:MOST_DRAWN]
+    hidden = [
+        name
+        for name, value in _positive(env_id).items()
+        if all(_takes(kind, name, share * value) for share in (0.8, 1.2))
+    ][:MOST_DRAWN]
     found = {
         "noise": {"observation_noise": 0.01},
         "late by a step": {"action_delay": task.interval},
@@ -104,7 +126,7 @@ def imperfections(env_id: str) -> list[Condition]:
     }
     if not (turning and task.examples.reach):
         del found["pushes"]
-    on = type(task).imperfections.keys()
+    on = kind.imperfections.keys()
     return [Condition(name, options) for name, options in found.items() if not options.keys() & on]
 
 

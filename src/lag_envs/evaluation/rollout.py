@@ -154,11 +154,13 @@ def act(agent: Any, observation: Any, memory: Any, start: Mask, shape: tuple[int
     try:
         with np.errstate(all="ignore"):
             action, memory = agent.predict(observation, memory, start, deterministic=True)
-        good = np.shape(action) == shape and np.isfinite(action).all()
+        found, good = np.shape(action), bool(np.isfinite(action).all())
     except Exception as error:  # nonsensical numbers may raise anything
         raise PolicyError(f"it fails with {ascii(f'{type(error).__name__}: {error}')[:200]}") from error
     if not good:
         raise PolicyError("it returned an action that is not a finite number")
+    if found != shape:
+        raise PolicyError(f"it returned actions of shape {found}, not {shape}")
     return action, memory
 
 

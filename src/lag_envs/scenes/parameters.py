@@ -88,6 +88,7 @@ def fill_in(scene: Any) -> None:
 
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
+    shown = "" if unit == "1" else f" {unit}"
     number = check_number(field.name, value, unit, endless=field.metadata["endless"])
     above = field.metadata["above"]
     for rule, limit, broken in (
@@ -96,9 +97,7 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
         ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
     ):
         if broken:
-            raise ValueError(
-                f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
-            )
+            raise ValueError(f"{field.name} must be {rule} {limit:g}{shown}, got {number:g}{shown}")
     return number
 
 

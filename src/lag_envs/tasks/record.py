@@ -205,7 +205,9 @@ class ValueIteration:
     targets : tuple of float
         Targets, from 0 on, to solve for. Others are interpolated, negative ones mirrored. Empty: none.
     pushes : int
-        Number of kick sizes in the expectation: midpoints of as many parts of its random number.
+        Number of kick sizes in the expectation: midpoints of as many parts of a kick's second random number.
+    chance : float
+        Chance of a kick per interval: there is one if its first random number is below.
     actions : int
         Number of actions, evenly spaced between the extremes.
     most : float
@@ -226,6 +228,7 @@ class ValueIteration:
     keep: tuple[int, ...] = ()
     targets: tuple[float, ...] = ()
     pushes: int = 0
+    chance: float = 0.01
     actions: int = 11
     most: float = 1.0
     levels: tuple[float, ...] = (2, 4, 8)
