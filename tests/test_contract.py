@@ -27,6 +27,7 @@ from lag_envs.scenes.derivation import code_of
 from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
+from lag_envs.scenes.symbolic import equations, t
 from lag_envs.scenes.two_link_arm import TwoLinkArm
 
 # --- places, velocities and controls ---
@@ -494,9 +495,24 @@ def test_lagrangian_is_t_less_v():
     assert {str(f.func) for f in fixed.atoms(sympy.Function)} == {"sin", "cos", "x"}
 
 
-def test_equations_are_solved_by_the_accelerations():
-    from lag_envs.scenes.symbolic import equations
+def test_a_parameter_named_t_is_no_time():
+    class Block(Scene):
+        coordinates = {"x": "m"}
+        t: float = parameter(2.0, "kg")
 
+        def kinetic(self, q, v, xp):
+            return self.t * v.x**2 / 2
+
+        def potential(self, q, xp):
+            return q.x**2 / 2
+
+    (equation,) = equations(Block())
+    x = sympy.Function("x", real=True)(t)
+    assert equation.lhs.coeff(x.diff(t)) == 0 and equation.lhs.coeff(x) == 1
+    assert r"t \frac{d^{2}}{d t^{2}} x" in sympy.latex(equation)
+
+
+def test_equations_are_solved_by_the_accelerations():
     scene = CartPole(friction=0.2)
     found = equations(scene)
     assert len(found) == 2 and r"\frac{d^{2}}{d t^{2}} x" in sympy.latex(found[0])

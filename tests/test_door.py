@@ -463,6 +463,17 @@ def parameter_without_annotation():
     return Bad
 
 
+@mistake("width replaces a field without an annotation", "width: float = parameter(...)")
+def parameter_replaced_by_a_number():
+    class Wide(Good):
+        width: float = parameter(1.0, "m")
+
+    class Bad(Wide):
+        width = 2.0
+
+    return Bad
+
+
 @mistake("left_out", "depends on 's'")
 def left_out_that_is_needed():
     class Bad(Good):

@@ -10,6 +10,7 @@ import sys
 
 import gymnasium as gym
 import numpy as np
+import own_tasks
 import pytest
 from covering import PERFECT, covering
 from gymnasium.envs.registration import EnvSpec
@@ -17,6 +18,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from rollouts import ANY_BAR, IDS, RENDERS, SINGLE, actions, make, nothing, trace
 
+import lag_envs
 from lag_envs.envs import program
 from lag_envs.envs.model import Model
 from lag_envs.envs.program import Program
@@ -87,6 +89,14 @@ unusual_spaces = pytest.mark.filterwarnings(
 @unusual_spaces
 def test_gymnasium_checker(env_id):
     check_env(make(env_id), skip_render_check=not RENDERS)
+
+
+@pytest.mark.parametrize("task", [*TASKS.values(), *own_tasks.TASKS], ids=lambda task: task.id)
+def test_keys_of_gymnasiums_play_are_actions(task):
+    env = gym.make(task.id if task.id in TASKS else lag_envs.register(task))
+    keys = env.unwrapped.get_keys_to_action()
+    assert list(keys) == ["", "a", "d", "ad"]
+    assert all(env.action_space.contains(action) for action in keys.values())
 
 
 @each_id

@@ -342,6 +342,10 @@ def test_subjects_are_the_scenes_of_tasks_and_the_others(write):
     assert [s.name for s in own.subjects(path + ":Other")] == ["Other"]
     with pytest.raises(UserError, match="has no task 'Pum'; did you mean Pump"):
         own.subjects(path + ":Pum")
+    told = []
+    broken = "\n\nclass Broken(Swing):\n    def kinetic(self, q, v, xp):\n        return None\n"
+    assert len(own.subjects(write(SCENE + broken, "half.py"), told.append)) == 1
+    assert len(told) == 1 and "left out: Broken: Broken.kinetic" in told[0]
     jobs = own.jobs(True, path)
     assert all(callable(getattr(own, job.function.rpartition(":")[2])) for job in jobs)
     names = [job.name for job in jobs]

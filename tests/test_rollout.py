@@ -68,7 +68,7 @@ def test_agents_that_return_no_action_are_found(action):
         def predict(self, observation, *args, **options):
             return np.full((len(observation), *np.shape(action)), action), None
 
-    with pytest.raises(PolicyError, match=r"it returned an? action|it fails with"):
+    with pytest.raises(PolicyError, match=r"it returned an? action|it returned actions|it fails with"):
         play(ENV, Agent(), range(2))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from covering import slow
 
-import lag_envs  # noqa: F401
+import lag_envs
 from lag_envs.envs.model import Model
 from lag_envs.tasks import TASKS, pivoted_bar
 from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleExact
@@ -17,6 +17,16 @@ from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleExact
 torch = pytest.importorskip("torch")
 
 from lag_envs.torch import Step, TorchVectorEnv  # noqa: E402
+
+
+class Braked(pivoted_bar.SwingUp):
+    """Kicks that depend on the state."""
+
+    id, draws = "Braked-v0", 1
+
+    def kick(self, after, draws, xp):
+        return {"theta_dot": -0.1 * after.theta_dot * draws[0]}
+
 
 #: One with a closed form, and one of the general series.
 IDS = ["PivotedBar-v0", slow(CartPoleContinuous.id)]
@@ -269,6 +279,8 @@ def test_errors(step):
         TorchVectorEnv(CartPoleExact.id, 2)
     with pytest.raises(ValueError, match="imperfect sensors, imperfect actuators or hidden parameters"):
         TorchVectorEnv(IDS[0], 2, action_delay=0.02)
+    with pytest.raises(ValueError, match="the kick of Braked-v0 depends on the state"):
+        TorchVectorEnv(lag_envs.register(Braked), 2)
     with pytest.raises(ValueError, match="give one value for all"):
         TorchVectorEnv(IDS[0], 2, damping=[0.0, 0.1])
     with pytest.raises(ValueError, match="not an environment of this package"):

@@ -35,6 +35,7 @@ import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.device import DeviceEnvs, made_vector
 from lag_envs.envs.interface import start_options
 from lag_envs.envs.model import Model
+from lag_envs.envs.reverse import kick_depends_on_state
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.envs.snapshots import Snapshot
 from lag_envs.envs.vector import LagrangianVectorEnv
@@ -175,7 +176,8 @@ class TorchVectorEnv:
     ------
     ValueError
         For an unavailable device, a task with imperfect sensors or actuators, and parameters that differ
-        between environments; on the CPU also for a task with discrete actions, and for float32.
+        between environments; on the CPU also for float32, and for a task with discrete actions or with kicks
+        that depend on the state.
     """
 
     envs: LagrangianVectorEnv | DeviceEnvs
@@ -204,6 +206,11 @@ class TorchVectorEnv:
         if any(other is not made.task for other in made.tasks):
             raise ValueError("gradients need the same parameters in all environments; give one value for all")
         _checked_task(made.task)
+        if made.task.draws and kick_depends_on_state(made.task):
+            raise ValueError(
+                f"the kick of {made.task.id or type(made.task).__name__} depends on the state, which "
+                "gradients would leave out; lag_envs.torch.Step takes steps without kicks"
+            )
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
         self._take_spaces(made)
         self.observation_space, self.action_space = made.observation_space, made.action_space

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -51,7 +52,8 @@ def run_report(args: argparse.Namespace) -> int:
                 raise UserError(
                     f"--{option} is for the report about this package: leave out --{option} or {file}"
                 )
-        own.subjects(file)  # errors in the file are reported before anything is measured
+        # Errors in the file are reported before anything is measured.
+        own.subjects(file, lambda text: print(text, file=sys.stderr))
         names: tuple[str, ...] = (own.SECTION,)
     else:
         names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections is not None else SECTIONS

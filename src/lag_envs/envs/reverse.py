@@ -21,7 +21,7 @@ from lag_envs.scenes.steps import check_turns, pulled
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.normal_forms import lifted
-from lag_envs.stepping.tracing import clip
+from lag_envs.stepping.tracing import TracedNumber, clip
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Reverse:
     Raises
     ------
     ValueError
-        For a task whose actions are choices, or whose kick depends on the state.
+        For a task whose actions are choices.
     """
 
     def __init__(self, task: Task, parameters: tuple[str, ...] = ()) -> None:
@@ -200,6 +200,21 @@ class Reverse:
         own = {"own_y": own_y, "own_u": own_u, "own_g": own_g, "own_p": []}
         by = self._before_of(xp, k, y, a, g, moved=moved, **own)
         return [*by, [xp.where(ordinary, 1.0, 0.0)]]
+
+
+def kick_depends_on_state(task: Task) -> bool:
+    """Return whether the change by a task's random kick has a derivative with respect to the state."""
+    formulas, xp = task.formulas, Differentiable()
+    z = xp.inputs(*(f"z{i}" for i in range(len(formulas.state))))
+    draws = xp.inputs(*(f"draw{i}" for i in range(task.draws)))
+    k = SimpleNamespace(**formulas.constants())
+    after = formulas.kick(xp, draws, lifted(form_of(task.scene), z, xp), k)
+    slopes = [xp.adjoint([end], [1.0], z) for end in after[: len(z)]]
+    return any(
+        isinstance(slope, TracedNumber) or slope != float(i == j)
+        for i, row in enumerate(slopes)
+        for j, slope in enumerate(row)
+    )
 
 
 def _sums(*lists: list) -> list:

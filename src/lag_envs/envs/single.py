@@ -240,12 +240,16 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         over = not self._ready or steps >= self.task.limit
         return self._viewer.draw(self.state, self.control, self.target, steps, self._total, episode, over)
 
-    def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
-        """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""
-        rest = self.task.rest_action
-        top = self.task.formulas.largest
-        keys = {"": rest, "a": -top, "d": top, "ad": rest}
-        return {pressed: np.array([action], FLOAT32) for pressed, action in keys.items()}
+    def get_keys_to_action(self) -> dict[str, NDArray]:
+        """Return the keys of `gymnasium.utils.play`: a and d for all controls' ends, else no control."""
+        formulas, space, rest = self.task.formulas, self.action_space, self.task.rest_action
+        low, high = np.array(-formulas.largest), np.array(formulas.largest)
+        if formulas.choices:
+            low, high = (np.array([end(a.values) for a in formulas.acting]) for end in (np.argmin, np.argmax))
+        return {
+            pressed: np.broadcast_to(np.asarray(action, space.dtype).squeeze(), self._actions.shape).copy()
+            for pressed, action in {"": rest, "a": low, "d": high, "ad": rest}.items()
+        }
 
     def close(self) -> None:
         """Close the window, if there is one."""

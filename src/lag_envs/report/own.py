@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -92,8 +92,15 @@ def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
     return np.array(states)
 
 
-def subjects(name: str) -> list[Subject]:
+def subjects(name: str, tell: Callable[[str], object] = str) -> list[Subject]:
     """Return the subjects of ``FILE`` or ``FILE:Class``: scenes of tasks, then scenes that no task uses.
+
+    Parameters
+    ----------
+    name : str
+        The file, perhaps with a class.
+    tell : callable, optional
+        Is told which scenes are left out, and why.
 
     Raises
     ------
@@ -118,6 +125,8 @@ def subjects(name: str) -> list[Subject]:
     if not found:
         why = "; ".join(problems) or "it defines no scene and no task"
         raise UserError(f"{path}: nothing to measure: {why}; {own_files.GUIDE}")
+    for problem in problems:
+        tell(f"{path}: left out: {problem}")
     return found
 
 
@@ -153,14 +162,14 @@ def subject(file: str, name: str) -> Subject:
 
 def jobs(quick: bool, file: str) -> list[ReportJob]:
     """Return the jobs: errors and certificate, stability, then everything that is timed."""
-    path = Path(own_files.split_path(file)[0])
-    # Rows from another version of the file are not reused.
+    path, found = Path(own_files.split_path(file)[0]), subjects(file)
+    # Rows from another version of the file, or of a scene that it imports, are not reused.
+    motions = repr([(s.scene, s.scene.mechanics.key) for s in found])
     about = {
         "file": str(path.resolve()) + file[len(str(path)) :],
-        "digest": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        "digest": hashlib.sha256(path.read_bytes() + motions.encode()).hexdigest()[:16],
         "quick": quick,
     }
-    found = subjects(file)
     kinds = {"steps": "shipped_steps", "stability": "stability", "points": "step_points"}
     return [
         ReportJob(

@@ -45,7 +45,7 @@ def is_own(kind: type) -> bool:
 
 
 def admit(scene: Any, base: type) -> None:
-    """Check a new scene: its parameters and, for the first of its kind, names and formulas.
+    """Check a new scene: its parameters, its mass matrix and, for the first of its kind, names and formulas.
 
     Parameters
     ----------
@@ -76,6 +76,8 @@ def admit(scene: Any, base: type) -> None:
         _check_motion(scene, scene.mechanics)
         _check_bodies(scene)
         _admitted[type(scene)][key] = layout, scene.mechanics
+    else:
+        _check_motion(scene, known[1])  # a parameter may have another sign
 
 
 def check_class(cls: type, base: type) -> None:
@@ -160,7 +162,10 @@ def _check_motion(scene: Any, found: Mechanics) -> None:
 
 
 def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> float:
-    """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, at its largest."""
+    """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, at its largest.
+
+    Or the first that is large enough.
+    """
     n = len(found.free)
     values = {recording.parameter(name): number(getattr(scene, name)) for name in parameter_names(scene)}
     generator = np.random.default_rng(11)
@@ -177,6 +182,8 @@ def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> 
             if not np.isfinite(matrix).all():
                 continue
             seen.append(smallest_eigenvalue(matrix))
+            if seen[-1] >= SINGULAR:
+                break
     return max(seen, default=math.inf)
 
 

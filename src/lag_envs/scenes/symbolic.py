@@ -72,6 +72,8 @@ def symbolic(scene: Scene) -> Any:
             ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least")
         )
         symbols[name] = sympy.Symbol(name, positive=True) if positive else sympy.Symbol(name, real=True)
+        if symbols[name] == t:  # a parameter is no time
+            symbols[name] = sympy.Symbol(name, real=True, polar=False)
     return twin(scene, symbols)
 
 

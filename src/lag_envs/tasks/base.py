@@ -204,7 +204,8 @@ class Task:
         for name in sorted(set(parameters) - set(known)):
             target = ["target"] if type(self).target else []
             options = [*sorted(known), "dt", "duration", *target, *KEYWORDS, *OF_ENVIRONMENTS]
-            meant = "gym.make_vec makes many;" if name in OF_BATCHES else hint(name, options, " ").strip()
+            close = hint(name, [*options, *OF_BATCHES], " ").strip()
+            meant = "gym.make_vec makes many;" if name in OF_BATCHES else close
             # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; {meant}{' ' if meant else ''}this environment "
@@ -255,7 +256,10 @@ class Task:
         raise FormulaError("it is not defined; write reward(self, before, after, control, target, dt, xp)")
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return the reward of the terminating step; by default, that of any other step."""
+        """Return the reward of the terminating step; by default, that of any other step.
+
+        It is scaled for another `dt` like `reward`, see `scaled`.
+        """
         return self.reward(before, after, control, target, dt, xp)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
@@ -463,7 +467,7 @@ class Task:
         if isinstance(target, Mapping):
             if set(target) != set(names):
                 raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
-            target = [target[name] for name in names]
+            target = [check_number(f"target {name}", target[name]) for name in names]
         elif len(names) == 1:
             return check_number("target", target)
         array = np.atleast_1d(real_array("target", target))

@@ -119,7 +119,7 @@ class DividedProgram(WholeProgram):
     def _begin_piece(self) -> list[str]:
         body = [
             self._key, *self._load_piece,
-            *self._load(self.a), *self._load(self.reaching, self.reached),
+            *self._load(self.a), *self.clip, *self._load(self.reaching, self.reached),
             *self._choose(self._lane),
             *self._store(["switch", "end", *self._mean]),
             *self._store([*self._commands, *self.reaching], [*self.u, *self.reached]),
