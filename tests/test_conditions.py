@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import own_tasks
 import pytest
 
 from lag_envs.controllers import Constant
@@ -35,6 +36,18 @@ def test_conditions_make_environments(env_id):
         changed = getattr(tasks[f"{name} +20 %"].scene, name)
         assert changed == pytest.approx(1.2 * getattr(tasks[NOMINAL].scene, name))
     assert disturbed == [f"{name} {sign}20 %" for name in numbers for sign in "-+"] and len(numbers) >= 3
+
+
+def test_numbers_that_a_task_refuses_are_left_out(monkeypatch):
+    class Narrow(own_tasks.Deliver):
+        def check(self):
+            if self.scene.load_mass > 1.1:
+                raise ValueError("too heavy")
+
+    monkeypatch.setitem(TASKS.data, Narrow.id, Narrow)
+    found = [condition.name for condition in disturbances(Narrow.id)]
+    assert "load_mass -20 %" in found and "trolley_mass +20 %" in found and "load_mass +20 %" not in found
+    assert all("load_mass" not in c.options.get("randomize", ()) for c in imperfections(Narrow.id))
 
 
 @pytest.mark.parametrize("env_id", TASKS)

@@ -24,12 +24,13 @@ from lag_envs.controllers import (
     do_nothing,
     make_controller,
 )  # fmt: skip
-from lag_envs.controllers.basic import ObservationDecoder, actions_for
+from lag_envs.controllers.basic import ObservationDecoder, Switch, actions_for, constant
 from lag_envs.controllers.ilqr import within
 from lag_envs.controllers.linear import Regulator, regulator, time_varying
 from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.controllers.mpc import MPC, planner, without_kicks
 from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergyShapingLQR
+from lag_envs.controllers.swing_up import easier
 from lag_envs.controllers.tracking import Tracking, search, waves
 from lag_envs.envs.model import Model
 from lag_envs.envs.single import LagrangianEnv
@@ -425,6 +426,87 @@ def test_only_what_can_be_read_is_read(shown, lost):
             continue
         with pytest.raises(ValueError, match=f"but not {lost} of Seen: observe every entry of the state"):
             make()
+
+
+def test_targets_must_be_told():
+    class Blind(own_tasks.Deliver):
+        id, draws, kick = "", 0, Task.kick
+
+        def observe(self, after, target, xp):
+            return {name: value for name, value in super().observe(after, target, xp).items() if name != "y"}
+
+        def bounds(self):
+            return {"sin": 1.0, "cos": 1.0}
+
+    for make in (MPC, lambda task: ILQR(task, [])):
+        with pytest.raises(ValueError, match=r"but Blind does not tell it: observe every target"):
+            make(Blind())
+    assert MPC(Blind(target=[0.2, -1.5]), budget=10).read is not None
+
+
+def swing(reward):
+    """Return a cart and pole without kicks that pays like this."""
+    own = {"id": "", "draws": 0, "kick": Task.kick, "reward": reward}
+    return type("Paid", (cart_pole.CartPoleContinuous,), own)()
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (lambda self, before, after, control, target, dt, xp: -control[0] * after.x, "apart from each other"),
+        (lambda self, before, after, control, target, dt, xp: -((after.x - before.x) ** 2), "after the step"),
+        (lambda self, before, after, control, target, dt, xp: -xp.abs(after.x), "needs a smooth reward"),
+        (lambda self, before, after, control, target, dt, xp: xp.where(after.x > 1.0, 0.0, 1.0), "smooth"),
+    ],
+)
+def test_a_regulator_takes_quadratic_rewards(reward, message):
+    with pytest.raises(ValueError, match=f"{message}.* that of Paid is not"):
+        regulator(swing(reward), [0.0] * 4)
+
+
+@pytest.mark.slow
+def test_regulators_of_one_control_among_two():
+    class Shoved(own_tasks.Deliver):
+        id, guard = "", Task.guard
+        defaults = {"gravity": 0.0}
+        action = {"push": 20.0}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return -(after.x**2) - (after.rope - 1.0) ** 2 - after.swing**2 - control.push**2
+
+    with pytest.raises(ValueError, match="check that the controls can bring it there"):
+        regulator(Shoved(), [0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # nothing acts on the rope
+
+
+def test_unequal_forces():
+    class Forward(cart_pole.CartPoleContinuous):
+        id = ""
+        action = {"force": (5.0, 14.0)}
+
+    with pytest.raises(ValueError, match="but force of Forward goes from 5 to 14"):
+        Regulator(Forward(), weights={"x": 1.0}, effort=1.0)
+    with pytest.raises(ValueError, match="strong in both directions; that of Forward goes"):
+        easier(Forward(), end={}, effort=1.0)
+
+
+def test_one_of_listed_actions():
+    task, observations = own_tasks.Switched(), np.zeros((4, len(own_tasks.Switched().observation)))
+    actions, _ = constant(task, action=2).predict(observations)
+    assert actions.tolist() == [2] * 4 and actions.dtype == np.int64
+    assert constant(Levers(), action=[1, 4]).predict(np.zeros((2, 9)))[0].tolist() == [[1, 4]] * 2
+    for action, message in ((3, "must be 0 to 2, got 3"), (0.5, "must be a whole number"), ([1], "shape")):
+        with pytest.raises(ValueError, match=message):
+            constant(task, action=action)
+    for index in (-1.0, 0.5, 3.0):
+        with pytest.raises(ValueError, match=f"numbers of choices, 0 to 2; got {index:g}"):
+            Model(task)(np.full((1, 8), 0.1), [index])
+
+
+def test_switches_know_their_observations():
+    with pytest.raises(ValueError, match="weights: there is no 'thetta'; did you mean theta"):
+        Switch(cart_pole.CartPoleContinuous(), weights={"thetta": 1.0})
+    with pytest.raises(ValueError, match="Switch takes one control; Deliver has several"):
+        Switch(own_tasks.Deliver(), weights={})
 
 
 class Levers(own_tasks.Deliver):

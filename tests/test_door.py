@@ -705,3 +705,22 @@ def test_a_mass_that_cancels_is_not_singular(gap, monkeypatch):
     dt = 1e-3 / math.sqrt(-acceleration)
     after = shell.simulate([0.1, 0.0, 0.0], [0.0], dt)[-1]
     assert after[1] == pytest.approx(acceleration * dt, rel=1e-4)
+
+
+def test_signs_of_the_mass_are_checked_for_every_scene():
+    class Mass(Scene):
+        coordinates = {"x": "m", "y": "m"}
+        m: float = parameter(1.0, "kg")
+        off: float = parameter(0.5, "kg")
+
+        def kinetic(self, q, v, xp):
+            return self.m * (v.x**2 + v.y**2) / 2 + self.off * v.x * v.y
+
+        def potential(self, q, xp):
+            return q.x**2 + q.y**2
+
+    assert Mass().m == 1.0
+    for numbers in ({"m": -1.0}, {"off": 1.0}, {"off": 2.0}):
+        with pytest.raises(FormulaError, match=r"Mass\.kinetic gives a mass matrix of x, y that is"):
+            Mass(**numbers)
+    assert Mass(m=3.0, off=2.0).off == 2.0

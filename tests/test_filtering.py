@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import own_tasks
 import pytest
 
 from lag_envs.controllers import build, make_controller
@@ -10,7 +11,9 @@ from lag_envs.controllers.basic import ObservationDecoder, constant
 from lag_envs.controllers.filtering import Filtered
 from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.cart_pole import CartPoleExact
 from lag_envs.tasks.chain import SwingUpTripleNoisy
+from lag_envs.tasks.incline import Tilt
 from lag_envs.tasks.registration import make_task
 
 ENV, NOISE = "PivotedBar-v0", 0.01
@@ -94,9 +97,19 @@ def test_renewing_gently_is_no_worse_than_following():
         ({"observation_noise": 0.01, "action_delay": 0.02}, "every observation on time"),
         ({"observation_noise": 0.01, "observation_every": 2}, "every observation on time"),
         ({"observation_noise": 0.01, "randomize": {"damping": (0.5, 2.0)}}, "needs known parameters"),
+        ({"observation_noise": 0.01, "lag": 0.05}, "controls that act at once"),
+        ({"observation_noise": 0.01, "slew": 1.0}, "controls that act at once"),
+        ({"observation_noise": 0.01, "action_noise": 0.1}, "action noise need drift > 0"),
+        ({"observation_noise": 0.01, "push": (1.0, 0.1)}, "pushes and action noise need drift > 0"),
     ],
 )
 def test_a_filter_is_refused_where_it_would_be_wrong(options, message):
     task = make_task(ENV, **options)
     with pytest.raises(ValueError, match=message):
         Filtered(task, constant(task, action=0.0))
+
+
+@pytest.mark.parametrize("kind", [own_tasks.Deliver, CartPoleExact, Tilt])
+def test_a_filter_is_refused_for_several_controls_lists_and_targets(kind):
+    with pytest.raises(ValueError, match=r"takes one control with continuous actions|has targets"):
+        Filtered(kind(observation_noise=0.01), None, drift=0.1)

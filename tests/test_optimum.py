@@ -18,6 +18,7 @@ import pytest
 from rollouts import Noisy, one_by_one
 from scipy.optimize import brentq, minimize_scalar
 
+import lag_envs
 from agents import optimum
 from agents.optimum import IMAGES, RESULTS, GreedyPolicy, Solution, extrapolated, grid, played, solvable
 from agents.run import fresh_seeds
@@ -31,7 +32,7 @@ from agents.value_iteration import (
     stretched,
 )
 from lag_envs.controllers import make_controller, optimal_return
-from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.basic import ObservationDecoder, constant
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import Rollout, play, record_rollout
 from lag_envs.leaderboard.protocol import first_seed
@@ -40,6 +41,7 @@ from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.arm import Reach
 from lag_envs.tasks.incline import Brake
+from lag_envs.tasks.pendulum import PendulumExact
 
 ROOT = Path(__file__).parents[1]
 COMPUTED = sorted(RESULTS.glob("*.json"))
@@ -294,6 +296,32 @@ def test_agent_acts_in_the_last_step_and_past_the_end(brake):
     action, taken = brake.predict(observation, np.array([499]))
     assert action.shape == (1,) and action.dtype == np.float32 and taken.tolist() == [500]
     brake.predict(observation, taken)
+
+
+class Listed(PendulumExact):
+    """Three torques."""
+
+    id = "Listed-v0"
+    action = {"torque": [-2.0, 0.0, 2.0]}
+
+
+def test_listed_actions_are_tried(monkeypatch):
+    monkeypatch.setitem(TASKS.data, Listed.id, Listed)
+    lag_envs.register(Listed)
+    agent = GreedyPolicy(Listed.id, level=0.5, folder=None)
+    assert agent.solution.programs[0].actions.tolist() == [0.0, 1.0, 2.0]
+    seeds = fresh_seeds(20)
+    returns = play(Listed.id, agent, seeds).mean()
+    assert (
+        returns > max(play(Listed.id, constant(Listed(), action=i), seeds).mean() for i in range(3)) + 300.0
+    )
+
+
+@pytest.mark.parametrize("numbers", [{"pushes": 0}, {"chance": 0.02}])
+def test_kicks_are_not_left_out(numbers, monkeypatch):
+    problem = dataclasses.replace(cylinder_in_cylinder.Damping.value_iteration, **numbers)
+    with pytest.raises(ValueError, match="value iteration would leave out the kicks of Cylinder"):
+        Solution(cylinder_in_cylinder.Damping.id, 0.25, None, problem=problem)
 
 
 def test_agent_is_there_for_what_is_solved():
