@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from covering import slow
+from gymnasium.wrappers.vector import ClipAction, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -17,7 +18,7 @@ from lag_envs.errors import UserError
 from lag_envs.evaluation.rollout import play
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
 from lag_envs.scores import known_returns, score
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks import TASKS, arm, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.measured import measured_entry
 from tools.missing import have
 
@@ -111,6 +112,62 @@ def test_adapter_attributes():
     assert len(envs.env_method("render")) == 3
     assert envs.render().ndim == 3  # tiled into one picture
     envs.close()
+
+
+def test_adapter_shares_out_only_what_belongs_to_each():
+    """It does not guess by length: here the numbers of environments are those of other things."""
+    for n in (2, 3):
+        adapter, dummy = pair(ENV, n)
+        assert adapter.reset().tobytes() == dummy.reset().tobytes()
+        for (o1, i1), (o2, i2) in zip(adapter.env_method("reset"), dummy.env_method("reset"), strict=True):
+            assert o1.tobytes() == o2.tobytes() and i1 == i2 == {}
+        for envs in (adapter, dummy):
+            envs.set_attr("mark", ["a"] * n)
+            assert envs.get_attr("mark") == [["a"] * n] * n
+    envs = make_vec_env(ENV, 2, mass=[0.1, 0.2], randomize={"damping": (0.1, 0.2)})
+    envs.reset()
+    drawn = envs.env.parameters["damping"].tolist()
+    assert envs.get_attr("parameters", [1, 0]) == [{"damping": d} for d in reversed(drawn)]
+    assert [task.scene.mass for task in envs.get_attr("task")] == [0.1, 0.2]
+    assert [scene.mass for scene in envs.get_attr("scene")] == [0.1, 0.2]
+
+
+def test_adapter_shows_one_picture_of_all():
+    envs = make_vec_env(ENV, 9, render_mode="rgb_array", show_tiles=4)
+    envs.reset()
+    (picture,) = envs.get_images()
+    assert picture.ndim == 3 and envs.render().tobytes() == picture.tobytes()
+    assert len(envs.env_method("render")) == 9
+
+
+def test_adapter_takes_targets_by_name():
+    """As the single environments do."""
+    goal = {"goal_x": 0.3, "goal_y": 0.4}
+    adapter, dummy = pair(arm.Reach.id)
+    for envs in (adapter, dummy):
+        envs.set_options({"target": goal})
+    assert adapter.reset().tobytes() == dummy.reset().tobytes()
+    adapter.set_options([{"target": goal | {"goal_x": x}} for x in (0.2, 0.3, 0.4)])
+    adapter.reset()
+    assert [target.tolist() for target in adapter.get_attr("target")] == [[x, 0.4] for x in (0.2, 0.3, 0.4)]
+
+
+def test_adapter_over_wrappers():
+    envs = VecEnv(ClipAction(gym.make_vec(ENV, 2, autoreset_mode="SameStep")))
+    envs.reset()
+    assert envs.get_attr("scene") == [envs.env.unwrapped.scene] * 2
+    envs.env_method("set_state", envs.env_method("get_state")[0])
+    envs.set_attr("mark", 7)
+    assert envs.get_attr("mark") == [7, 7]
+
+
+def test_adapter_passes_on_what_wrappers_report():
+    batch = gym.make_vec(ENV, 2, autoreset_mode="SameStep", duration=0.1)
+    envs = VecEnv(RecordEpisodeStatistics(batch))
+    envs.reset()
+    ends = [[info.get("episode", {}).get("l") for info in envs.step(np.zeros((2, 1)))[3]] for _ in range(5)]
+    assert ends == [[None, None]] * 4 + [[5, 5]]
+    assert envs.get_attr("episode_count") == [2, 2]
 
 
 def test_adapter_refuses_another_autoreset_mode():

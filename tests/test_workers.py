@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -70,6 +71,12 @@ def test_a_death_belongs_to_its_work_though_its_message_is_late(given, monkeypat
         futures = {what: submit(work, what, timeout=limits.get(what)) for what in given}
         assert died(futures["dies"].exception(timeout=60.0)) == "the process died, exit status 3"
         assert futures["works"].result(timeout=60.0) == ("hello", "1")
+
+
+def test_an_error_counts_though_it_is_falsy():
+    future = Future()
+    future.set_exception(error := type("Empty", (Exception,), {"__len__": lambda _: 0})())
+    assert list(as_they_finish({future: "work"})) == [("work", error)]
 
 
 def test_who_leaves_early_does_not_wait():

@@ -12,7 +12,7 @@ form.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -89,7 +89,7 @@ class VecEnv(vec_env.VecEnv):
     def reset(self) -> NDArray[np.float32]:
         """Begin an episode in every environment, with the seeds and options set before."""
         seeds: Any = self._seeds  # Gymnasium's types allow only one seed
-        observations, infos = self.env.reset(seed=seeds, options=self._stacked_options())
+        observations, infos = self.env.reset(seed=seeds, options=_stack(self._options) or None)
         if self._stagger:
             seed = None if self._seeds[0] is None else int(self._seeds[0])
             observations, infos = stagger(self.env, self._stagger, seed)
@@ -115,8 +115,10 @@ class VecEnv(vec_env.VecEnv):
             final = infos.get("final_info", {})
             for i in ended:
                 self.reset_infos[i] = each[i]
-                last = {"TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
-                each[i] = _row(final, i) | last | {"terminal_observation": infos["final_obs"][i]}
+                last: dict[str, Any] = {"TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
+                last["terminal_observation"] = infos["final_obs"][i]
+                # Wrappers report the end beside what the next episode's reset reports.
+                each[i] = each[i] | _row(final, i, self.num_envs) | last
         return observations, rewards.astype(np.float32), done, each
 
     def close(self) -> None:
@@ -124,28 +126,37 @@ class VecEnv(vec_env.VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return a picture of each environment, if made with ``render_mode="rgb_array"``."""
+        """Return a picture of each environment, or with ``show_tiles`` one of them all.
+
+        They are None if the environment was made without ``render_mode="rgb_array"``.
+        """
         frames: Any = self.env.render() if self.render_mode is not None else None
+        if isinstance(frames, np.ndarray) and frames.ndim == 3:
+            return [frames]
         return [None] * self.num_envs if frames is None else list(frames)
 
     # --- attributes of the environments ---------------------------------------------------------------------
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environments; one row for each if the batch has an array."""
+        if attr_name == "scene":
+            return [task.scene for task in self.get_attr("tasks", indices)]
         single = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
-        return self._share(getattr(self.env, single.get(attr_name, attr_name)), indices)
+        name = (single | {"task": "tasks"}).get(attr_name, attr_name)
+        return self._share(name, getattr(self._owner(name), name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of all environments: a batch has only one of each."""
         self._all(indices, "set")
-        setattr(self.env.unwrapped, attr_name, value)
+        setattr(self._owner(attr_name), attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of the batch, for all environments; return the result for each."""
         self._all(indices, "call")
-        return self._share(getattr(self.env, method_name)(*method_args, **method_kwargs), None)
+        result = getattr(self._owner(method_name), method_name)(*method_args, **method_kwargs)
+        return self._share(method_name, result, None)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
         """Return False for each: single environments in a batch cannot be wrapped."""
@@ -153,23 +164,23 @@ class VecEnv(vec_env.VecEnv):
 
     # --- internal -------------------------------------------------------------------------------------------
 
-    def _stacked_options(self) -> dict[str, Any] | None:
-        """Return the options of the environments as arrays of the batch."""
-        names = {name for options in self._options for name in options}
-        if any(names != set(options) for options in self._options):
-            raise ValueError("either all environments are given the same reset options, or none")
-        return {name: np.array([o[name] for o in self._options]) for name in names} or None
-
     def _split(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
         """Return an info for each environment."""
         reported = {k: v for k, v in infos.items() if k.lstrip("_") not in ("final_obs", "final_info")}
         if not reported:
             return [{} for _ in range(self.num_envs)]
-        return [_row(reported, i) for i in range(self.num_envs)]
+        return [_row(reported, i, self.num_envs) for i in range(self.num_envs)]
 
-    def _share(self, value: Any, indices: Any) -> list[Any]:
-        each = isinstance(value, np.ndarray | list | tuple) and len(value) == self.num_envs
-        return [value[i] if each else value for i in self._get_indices(indices)]
+    def _owner(self, name: str) -> VectorEnv:
+        """Return who has an attribute: wrappers of vector environments do not pass on what they lack."""
+        return self.env if hasattr(self.env, name) else self.env.unwrapped
+
+    def _share(self, name: str, value: Any, indices: Any) -> list[Any]:
+        """Return the part of each environment in what the batch's attribute or method `name` gave."""
+        chosen: Iterable[int] = self._get_indices(indices)
+        if name not in ("tasks", "render"):
+            return [_row(value, i, self.num_envs) for i in chosen]
+        return [value[i] if isinstance(value, list | tuple) else value for i in chosen]
 
     def _all(self, indices: Any, verb: str) -> None:
         chosen: Iterable[int] = self._get_indices(indices)
@@ -179,9 +190,33 @@ class VecEnv(vec_env.VecEnv):
             )
 
 
-def _row(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """Return the part of a vector environment's infos for environment i: where the mask "_name" is set."""
-    return {k: v[i] for k, v in infos.items() if not k.startswith("_") and infos[f"_{k}"][i]}
+def _row(value: Any, i: int, n: int) -> Any:
+    """Return the part of a batch's value for environment i of n.
+
+    Arrays have a row for each environment, also within tuples and mappings; in a mapping, a mask "_name" says
+    which environments have an entry. Anything else belongs to each environment as a whole.
+    """
+    if isinstance(value, np.ndarray) and value.shape[:1] == (n,):
+        return value[i]
+    if type(value) is tuple:
+        return tuple(_row(v, i, n) for v in value)
+    if isinstance(value, Mapping):
+        masks = {f"_{k}" for k in value} & set(value)
+        return {
+            k: _row(v, i, n)
+            for k, v in value.items()
+            if k not in masks and (f"_{k}" not in masks or value[f"_{k}"][i])
+        }
+    return value
+
+
+def _stack(values: Sequence[Any]) -> Any:
+    """Return reset options of the environments as arrays of the batch, those in mappings by name."""
+    if not all(isinstance(v, Mapping) for v in values):
+        return np.array(values)
+    if any(set(v) != set(values[0]) for v in values):
+        raise ValueError("either all environments are given the same reset options, or none")
+    return {name: _stack([v[name] for v in values]) for name in values[0]}
 
 
 class ScaledReward(vec_env.VecEnvWrapper):

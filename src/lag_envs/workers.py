@@ -36,7 +36,8 @@ class SpreadError(UserError):
 def as_they_finish(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
     """Yield what each future returned or raised, in the order in which they finish."""
     for future in as_completed(futures):
-        yield futures[future], future.exception() or future.result()
+        error = future.exception()
+        yield futures[future], future.result() if error is None else error
 
 
 def died(error: BaseException) -> str:
