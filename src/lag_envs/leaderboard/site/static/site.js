@@ -1290,10 +1290,12 @@
     width = document.body.clientWidth;
     requestAnimationFrame(again);
   }).observe(document.body);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  const recolour = () => {
     readColours();
     again();
-  });
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
+  new MutationObserver(recolour).observe(document.documentElement, { attributeFilter: ["data-scheme"] });
   // Keep the current environment in view if the list of environments scrolls.
   const here = find(".top nav [aria-current]");
   if (here) here.closest("ul").scrollLeft = here.offsetLeft - 24;
