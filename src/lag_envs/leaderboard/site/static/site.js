@@ -75,12 +75,15 @@
   const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
   const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
 
-  /** "theta_dot", "theta_1_dot" or "psi''" as on paper, "elbow_torque" as words. */
+  /** "theta_1" as θ₁, "theta_dot" as dθ/dt, "psi''" as d²ψ/dt², whose dots are lost in small print; others as words. */
   function symbol(name) {
     const [, base, index = "", rate = ""] = name.match(/^(.+?)(?:_(\d+))?(_d+ot|'+)?$/) ?? ["", name];
-    const dots = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
+    const order = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
     const lower = index.replace(/\d/g, (digit) => String.fromCharCode(0x2080 + Number(digit)));
-    return (GREEK[base] ?? base.replace(/_/g, " ")) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
+    const words = (GREEK[base] ?? base.replace(/_/g, " ")) + lower;
+    if (!order) return words;
+    const power = order > 1 ? "⁰¹²³⁴⁵⁶⁷⁸⁹"[order] : "";
+    return `d${power}${base.length > 1 && !GREEK[base] ? `(${words})` : words}/dt${power}`;
   }
 
   // --- scenes ----------------------------------------------------------------------------------------------
