@@ -401,6 +401,8 @@ def test_pictures_of_the_ranking(open_page):
     # The value function and the path over it; another pair of coordinates has none.
     until(page, "document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
     shaded = colours(page, ".phase")
+    pairs = page.locator(".pair option").all_inner_texts()
+    assert pairs == ["θ [rad], dθ/dt [rad/s]", "s [m], ds/dt [m/s]"]
     page.select_option(".pair select", "1")
     until(page, "document.querySelector('.phase').ariaLabel.startsWith('s [m] against ')")
     assert 100 < colours(page, ".phase") < shaded
@@ -465,6 +467,48 @@ def test_agents_page(open_page):
     page.click(".play")
     until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.1")
     assert page.evaluate("document.querySelectorAll('#curves path').length") >= 3
+
+
+def test_environments_are_listed_in_a_menu(open_page, data, documented):
+    """By keyboard, pointer and without a script; it covers the page instead of moving it, at every width."""
+    own, root = cylinder_in_cylinder.Tilt.id, f"{documented}/board"
+    page = open_page(own, root, bypass_csp=True)
+    top, focus = (
+        "document.querySelector('main').getBoundingClientRect().top",
+        "document.activeElement.innerText",
+    )
+    is_open, summary = "document.querySelector('.menu').open", page.locator(".menu summary")
+    summary.focus()
+    page.keyboard.press("Enter")
+    listed = page.locator(".menu > ul > li").all_inner_texts()
+    groups = {type(TASKS[b["id"]]().scene).__name__: b["id"] for b in data["environments"]}
+    assert [text.split() for text in listed] == [[scene, env_id] for scene, env_id in sorted(groups.items())]
+    assert page.locator(".menu [aria-current=page]").inner_text() == own
+    assert serious(page) == []
+    page.keyboard.press("Tab")
+    assert page.evaluate(focus) == min(groups.items())[1]
+    page.keyboard.press("Escape")
+    assert not page.evaluate(is_open) and page.evaluate(focus) == "Environments"
+    summary.click()
+    page.mouse.click(640, 880)
+    assert not page.evaluate(is_open)
+    summary.click()
+    page.keyboard.press("Shift+Tab")
+    assert not page.evaluate(is_open), "it does not cover what has the focus"
+    for script in (True, False):
+        page = open_page(own, root, java_script_enabled=script, is_mobile=True, has_touch=True)
+        for width in (320, 768, 1280, 1920):
+            page.set_viewport_size({"width": width, "height": 640})
+            before = page.evaluate(top)
+            assert before < 200
+            page.tap(".menu summary")
+            assert page.evaluate(f"{is_open} && document.documentElement.scrollWidth") == width
+            box = page.locator(".menu > ul").bounding_box()
+            assert page.evaluate(top) == before and box["y"] + box["height"] <= 640
+            page.tap(".menu summary")
+        page.tap(".menu summary")
+        page.tap(f".menu a:text-is('{incline.Brake.id}')")
+        page.wait_for_url(f"**/{incline.Brake.id}.html")
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
  *
  * Submissions are untrusted: their contents become text (textContent) or numbers, never markup.
  *
- * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, start.
+ * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, overview, menu, start.
  * Driving itself is in episode.js and drive.js, which are loaded on demand.
  */
 (() => {
@@ -1265,11 +1265,30 @@
     place.append(svg);
   }
 
+  // --- menu ------------------------------------------------------------------------------------------------
+
+  /** Close the list of environments on Escape, and when the reader turns to something else. */
+  function startMenu() {
+    const menu = find(".menu");
+    const away = ({ target }) => {
+      if (!menu.contains(target)) menu.open = false;
+    };
+    menu.addEventListener("toggle", () => find("[aria-current]", menu)?.scrollIntoView({ block: "nearest" }));
+    document.addEventListener("pointerdown", away);
+    document.addEventListener("focusin", away);
+    document.addEventListener("keydown", ({ key }) => {
+      if (key !== "Escape" || !menu.open) return;
+      menu.open = false;
+      find("summary", menu).focus();
+    });
+  }
+
   // --- start -----------------------------------------------------------------------------------------------
 
   window.lagEnvs = { put, load, placed, windowOf, apart };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
+  startMenu();
   readColours();
   const redraw = [];
   if (Array.isArray(data)) {
@@ -1299,7 +1318,4 @@
   };
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
   new MutationObserver(recolour).observe(document.documentElement, { attributeFilter: ["data-scheme"] });
-  // Keep the current environment in view if the list of environments scrolls.
-  const here = find(".top nav [aria-current]");
-  if (here) here.closest("ul").scrollLeft = here.offsetLeft - 24;
 })();
