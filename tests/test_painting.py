@@ -113,8 +113,8 @@ def test_png_can_be_read(tmp_path):
 def test_colours_and_widths_are_those_of_the_page():
     """`site.js` paints the same shapes in a browser; its style sheet has the colours of light and dark."""
     site = Path(painting.__file__).parents[1] / "leaderboard" / "site" / "static"
-    css = (site / "site.css").read_text(encoding="utf-8").partition("@media")[0]
-    colour = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", css))
+    css = (site / "site.css").read_text(encoding="utf-8")
+    colour = dict(re.findall(r"--([\w-]+): var\(--light, (#[0-9a-f]{6})\)", css))
     roles = re.search(r"ink\.roles = \{(.*?)\n    \};", (site / "site.js").read_text(encoding="utf-8"), re.S)
     found = {}
     for role, given in re.findall(r"(\w+): \[(.*)\],", roles[1]):

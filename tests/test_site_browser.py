@@ -5,6 +5,7 @@ import itertools
 import json
 import runpy
 import threading
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from browsers import serious, until
 from covering import every, slow
 from toy_pendulum import Swing
 
+from lag_envs import store
 from lag_envs.leaderboard.board import Board
-from lag_envs.leaderboard.site.build import write_page
+from lag_envs.leaderboard.site.build import render, write_page
 from lag_envs.leaderboard.site.scenery import picture_data
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.scenes import TwoLinkArm
@@ -43,9 +45,9 @@ def folder(data, tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module")
-def served(folder):
-    """Return the address of the page on a server."""
+@contextmanager
+def serving(folder):
+    """Serve a folder, and return its address."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *args):
@@ -55,6 +57,24 @@ def served(folder):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def served(folder):
+    """Return the address of the page on a server."""
+    with serving(folder) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def documented(data, tmp_path_factory):
+    """Return the address of a server whose folder ``board`` has the page as a part of the documentation."""
+    folder = tmp_path_factory.mktemp("documented")
+    for content in render(data, "", [("Home", "../index.html")], documentation="../environments/"):
+        for name, text in content.items():
+            store.write_file(folder / "board" / name, text)
+    with serving(folder) as address:
+        yield address
 
 
 @pytest.fixture
@@ -381,6 +401,8 @@ def test_pictures_of_the_ranking(open_page):
     # The value function and the path over it; another pair of coordinates has none.
     until(page, "document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
     shaded = colours(page, ".phase")
+    pairs = page.locator(".pair option").all_inner_texts()
+    assert pairs == ["θ [rad], dθ/dt [rad/s]", "s [m], ds/dt [m/s]"]
     page.select_option(".pair select", "1")
     until(page, "document.querySelector('.phase').ariaLabel.startsWith('s [m] against ')")
     assert 100 < colours(page, ".phase") < shaded
@@ -447,6 +469,48 @@ def test_agents_page(open_page):
     assert page.evaluate("document.querySelectorAll('#curves path').length") >= 3
 
 
+def test_environments_are_listed_in_a_menu(open_page, data, documented):
+    """By keyboard, pointer and without a script; it covers the page instead of moving it, at every width."""
+    own, root = cylinder_in_cylinder.Tilt.id, f"{documented}/board"
+    page = open_page(own, root, bypass_csp=True)
+    top, focus = (
+        "document.querySelector('main').getBoundingClientRect().top",
+        "document.activeElement.innerText",
+    )
+    is_open, summary = "document.querySelector('.menu').open", page.locator(".menu summary")
+    summary.focus()
+    page.keyboard.press("Enter")
+    listed = page.locator(".menu > ul > li").all_inner_texts()
+    groups = {type(TASKS[b["id"]]().scene).__name__: b["id"] for b in data["environments"]}
+    assert [text.split() for text in listed] == [[scene, env_id] for scene, env_id in sorted(groups.items())]
+    assert page.locator(".menu [aria-current=page]").inner_text() == own
+    assert serious(page) == []
+    page.keyboard.press("Tab")
+    assert page.evaluate(focus) == min(groups.items())[1]
+    page.keyboard.press("Escape")
+    assert not page.evaluate(is_open) and page.evaluate(focus) == "Environments"
+    summary.click()
+    page.mouse.click(640, 880)
+    assert not page.evaluate(is_open)
+    summary.click()
+    page.keyboard.press("Shift+Tab")
+    assert not page.evaluate(is_open), "it does not cover what has the focus"
+    for script in (True, False):
+        page = open_page(own, root, java_script_enabled=script, is_mobile=True, has_touch=True)
+        for width in (320, 768, 1280, 1920):
+            page.set_viewport_size({"width": width, "height": 640})
+            before = page.evaluate(top)
+            assert before < 200
+            page.tap(".menu summary")
+            assert page.evaluate(f"{is_open} && document.documentElement.scrollWidth") == width
+            box = page.locator(".menu > ul").bounding_box()
+            assert page.evaluate(top) == before and box["y"] + box["height"] <= 640
+            page.tap(".menu summary")
+        page.tap(".menu summary")
+        page.tap(f".menu a:text-is('{incline.Brake.id}')")
+        page.wait_for_url(f"**/{incline.Brake.id}.html")
+
+
 @pytest.mark.slow
 def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     moved = """new Promise(done => { const c = document.querySelector('.hero canvas');
@@ -461,6 +525,36 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     assert not page.evaluate(moved)
     page.click(".film")
     assert page.evaluate(moved)
+
+
+def test_the_documentations_choice_of_light_or_dark_is_followed(open_page, documented):
+    """By pictures too, and when it changes; if anything else is stored, the system's is."""
+    key, root = "/.__palette", f"{documented}/board"
+    slate, default = (json.dumps({"color": {"scheme": name}}) for name in ("slate", "default"))
+
+    def look(page):
+        page.wait_for_timeout(50)  # observers
+        return page.evaluate("""[getComputedStyle(document.documentElement).colorScheme,
+            getComputedStyle(document.body).backgroundColor, document.querySelector('canvas').toDataURL()]""")
+
+    page = open_page("index", root, color_scheme="light")
+    light = look(page)
+    page.emulate_media(color_scheme="dark")
+    dark = look(page)
+    assert (light[0], dark[0]) == ("light", "dark") and not set(light) & set(dark)
+    rubbish = ("{", "null", "3", '{"color": 1}', '{"color": {"scheme": {}}}')
+    for stored, wanted in ((default, light), (slate, dark), (default, light), *((x, dark) for x in rubbish)):
+        page.evaluate("([key, value]) => { localStorage[key] = value; dispatchEvent(new Event('storage')); }",
+                      [key, stored])  # fmt: skip
+        assert look(page) == wanted, stored
+    stored = {"origin": documented, "localStorage": [{"name": key, "value": slate}]}
+    page = open_page("index", root, color_scheme="light", storage_state={"cookies": [], "origins": [stored]})
+    assert look(page) == dark
+    early = "(e => !e.defer && !e.async && e.src.includes('/scheme-'))(document.querySelector('head script'))"
+    assert page.evaluate(early), "it decides before the first paint"
+    page.add_init_script("Object.defineProperty(window, 'localStorage', { get() { throw Error(); } })")
+    page.reload()
+    assert look(page) == light
 
 
 @pytest.mark.parametrize(

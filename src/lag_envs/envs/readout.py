@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 #: Height of a row, and least width of its columns [pixels].
 ROW, COLUMN = 20, 90
 STRIP_PAPER, INK = "#f2f2f2", "#303030"
-#: A name: a letter or word, an index, a derivative. The board's page has the same rule, `symbol` in site.js.
+#: A name: a letter or word, an index, a derivative. The board's page reads it alike, `symbol` in site.js.
 NAME = re.compile(r"^(.+?)(?:_(\d+))?(_d+ot|'+)?$")
 
 

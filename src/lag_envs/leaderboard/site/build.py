@@ -165,6 +165,7 @@ def render(
 
     style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
     script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
+    scheme = documentation and keep("scheme", "js", (STATIC / "scheme.js").read_text("utf-8"))
     parts = "\n".join((STATIC / f"{name}.js").read_text("utf-8") for name in ("episode", "drive"))
     drive = keep("drive", "js", f'"use strict";\n(() => {{\n{parts}}})();\n')
     boards, taken = [], {"index"}
@@ -203,7 +204,7 @@ def render(
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
         "made": data["made"], "style": style,
-        "script": script, "drive": drive, "protocol": data["protocol"],
+        "script": script, "scheme": scheme, "drive": drive, "protocol": data["protocol"],
         "embed": lambda value: Markup(page_json(value)), "url": url and url.rstrip("/") + "/",
         "site": site, "source": source, "documentation": documentation,
         "preview": next((b["preview"] for b in boards), None),
@@ -266,6 +267,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "pairs": [],
         "controls": [],
         "dt": None,
+        "scene": "",
         "title": given["id"],
         "about": [],
         "difficulty": "",

@@ -42,11 +42,11 @@ def scenery_data(env_id: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``open`` (None, or ``knows``,
-        ``share`` and ``tried``: method, budget, return), ``state_names``, ``state_units``, ``pairs`` (the
-        entries that are a coordinate and its rate), ``controls`` (those that actions set), ``dt`` [s] and
-        ``picture`` (None if the scene has no bodies). Empty for an id that this version does not have, such
-        as a frozen board's.
+        ``scene`` (its class's name), ``title``, ``about`` (its description's paragraphs), ``difficulty``,
+        ``open`` (None, or ``knows``, ``share`` and ``tried``: method, budget, return), ``state_names``,
+        ``state_units``, ``pairs`` (the entries that are a coordinate and its rate), ``controls`` (those that
+        actions set), ``dt`` [s] and ``picture`` (None if the scene has no bodies). Empty for an id that this
+        version does not have, such as a frozen board's.
 
     Examples
     --------
@@ -61,6 +61,7 @@ def scenery_data(env_id: str) -> dict[str, Any]:
     title, _, text = (inspect.getdoc(type(task)) or env_id).partition("\n")
     description = re.search(r"## Description\n+(.*?)(?=\n+## |\Z)", text, re.DOTALL)
     return {
+        "scene": type(task.scene).__name__,
         "title": title,
         "about": [
             _plain(paragraph)

@@ -3,7 +3,7 @@
  *
  * Submissions are untrusted: their contents become text (textContent) or numbers, never markup.
  *
- * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, start.
+ * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, overview, menu, start.
  * Driving itself is in episode.js and drive.js, which are loaded on demand.
  */
 (() => {
@@ -75,12 +75,15 @@
   const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
   const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
 
-  /** "theta_dot", "theta_1_dot" or "psi''" as on paper, "elbow_torque" as words. */
+  /** "theta_1" as θ₁, "theta_dot" as dθ/dt, "psi''" as d²ψ/dt², whose dots are lost in small print; others as words. */
   function symbol(name) {
     const [, base, index = "", rate = ""] = name.match(/^(.+?)(?:_(\d+))?(_d+ot|'+)?$/) ?? ["", name];
-    const dots = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
+    const order = rate.startsWith("'") ? rate.length : rate.length && rate.length - 3;
     const lower = index.replace(/\d/g, (digit) => String.fromCharCode(0x2080 + Number(digit)));
-    return (GREEK[base] ?? base.replace(/_/g, " ")) + ["", "\u0307", "\u0308"][Math.min(dots, 2)] + lower;
+    const words = (GREEK[base] ?? base.replace(/_/g, " ")) + lower;
+    if (!order) return words;
+    const power = order > 1 ? "⁰¹²³⁴⁵⁶⁷⁸⁹"[order] : "";
+    return `d${power}${base.length > 1 && !GREEK[base] ? `(${words})` : words}/dt${power}`;
   }
 
   // --- scenes ----------------------------------------------------------------------------------------------
@@ -1262,11 +1265,30 @@
     place.append(svg);
   }
 
+  // --- menu ------------------------------------------------------------------------------------------------
+
+  /** Close the list of environments on Escape, and when the reader turns to something else. */
+  function startMenu() {
+    const menu = find(".menu");
+    const away = ({ target }) => {
+      if (!menu.contains(target)) menu.open = false;
+    };
+    menu.addEventListener("toggle", () => find("[aria-current]", menu)?.scrollIntoView({ block: "nearest" }));
+    document.addEventListener("pointerdown", away);
+    document.addEventListener("focusin", away);
+    document.addEventListener("keydown", ({ key }) => {
+      if (key !== "Escape" || !menu.open) return;
+      menu.open = false;
+      find("summary", menu).focus();
+    });
+  }
+
   // --- start -----------------------------------------------------------------------------------------------
 
   window.lagEnvs = { put, load, placed, windowOf, apart };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
+  startMenu();
   readColours();
   const redraw = [];
   if (Array.isArray(data)) {
@@ -1290,11 +1312,10 @@
     width = document.body.clientWidth;
     requestAnimationFrame(again);
   }).observe(document.body);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  const recolour = () => {
     readColours();
     again();
-  });
-  // Keep the current environment in view if the list of environments scrolls.
-  const here = find(".top nav [aria-current]");
-  if (here) here.closest("ul").scrollLeft = here.offsetLeft - 24;
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
+  new MutationObserver(recolour).observe(document.documentElement, { attributeFilter: ["data-scheme"] });
 })();
