@@ -98,8 +98,10 @@ def declare_scene(cls: Any, meta: type[type]) -> None:
         delattr(cls, name)
     inherited = {name for parent in cls.__mro__[1:] for name in getattr(parent, "__dataclass_fields__", ())}
     for name in sorted(inherited.intersection(own) - {*annotations, "control"}):
-        # A dataclass would keep the other default.
-        faults.append(f"{name} replaces a field without an annotation; write {name}: float = parameter(...)")
+        if not inspect.ismemberdescriptor(own[name]):  # a slot; of anything else a dataclass takes no notice
+            faults.append(
+                f"{name} replaces a field without an annotation; write {name}: float = parameter(...)"
+            )
     if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
         annotations["control"] = "str"
         if "control" not in own:

@@ -88,7 +88,7 @@ def fill_in(scene: Any) -> None:
 
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
-    shown = "" if unit == "1" else f" {unit}"
+    shown = _shown_unit(field)
     number = check_number(field.name, value, unit, endless=field.metadata["endless"])
     above = field.metadata["above"]
     for rule, limit, broken in (
@@ -103,14 +103,20 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
 
 def _check_made(field: dataclasses.Field, value: Any) -> float:
     """Return a value computed from other parameters; it may be smaller or larger than a given one."""
-    unit, number = field.metadata["unit"], check_number(field.name, value)
+    shown, number = _shown_unit(field), check_number(field.name, value)
     for rule, limit, broken in _rules(field, number):
         if broken:
             raise ValueError(
-                f"{field.name} must be {rule} {limit:g} {unit}, but follows as {number:g} {unit} from the "
+                f"{field.name} must be {rule} {limit:g}{shown}, but follows as {number:g}{shown} from the "
                 "other parameters"
             )
     return number
+
+
+def _shown_unit(field: dataclasses.Field) -> str:
+    """Return a parameter's unit as it follows a number."""
+    unit = field.metadata["unit"]
+    return "" if unit in ("", "1") else f" {unit}"
 
 
 def _rules(field: dataclasses.Field, number: float) -> list[tuple[str, Any, bool]]:
