@@ -354,6 +354,22 @@ def test_subjects_are_the_scenes_of_tasks_and_the_others(write):
     ]
 
 
+def test_rows_belong_to_the_physics_wherever_it_is_written(write, monkeypatch):
+    """A scene's formulas, or its defaults, may come from another file."""
+    from lag_envs.report import own
+
+    path = write(SCENE)
+    (subject,), (job, *_) = own.subjects(path), own.jobs(True, path)
+
+    class Heavier(type(subject.scene)):
+        def potential(self, q, xp):
+            return 2.0 * super().potential(q, xp)
+
+    for scene in (Heavier(), type(subject.scene)(length=2.0)):
+        monkeypatch.setattr(own, "subjects", lambda file, scene=scene: [subject._replace(scene=scene)])
+        assert own.jobs(True, path)[0].arguments["digest"] != job.arguments["digest"]
+
+
 @pytest.mark.slow
 def test_stiff_parameters_are_counted(write, monkeypatch):
     from lag_envs.report import own
