@@ -359,8 +359,8 @@ def _check_dissipation(scene: Any, loss: Expr) -> None:
     if degrees and max(degrees) == 1:
         raise FormulaError(
             f"{of} is proportional to velocities, so it would push with a constant force; return a function "
-            "whose derivative by the velocity is the drag, such as 0.5 * b * v.x**2 for b * v.x; forces belong "
-            "in applied"
+            "whose derivative by the velocity is the drag, such as 0.5 * b * v.x**2 for b * v.x; forces "
+            "belong in applied"
         )
 
 
