@@ -385,6 +385,11 @@ def test_forces_of_what_moves_have_names():
     # x' = -s' - spring x / m: the force on s is m (x'' + s'') - 3.
     assert Rail().forces([0.0, 0.0, 1.0, 0.0], 5.0) == {"drive_s": -5.0}
 
+    class Placed(Rail):
+        controls = {"s": "m"}
+
+    assert Placed().forces([1.0, 0.0], 5.0) == {}
+
 
 def test_control_may_stand_without_its_axis():
     scene, states = CartPole(), np.random.default_rng(1).normal(size=(5, 4))
@@ -516,6 +521,10 @@ def test_equations_are_solved_by_the_accelerations():
     scene = CartPole(friction=0.2)
     found = equations(scene)
     assert len(found) == 2 and r"\frac{d^{2}}{d t^{2}} x" in sympy.latex(found[0])
+    # A tilt that is the control is held: it is in the equation, but not its rates.
+    tilted, tilt = Incline(control="tilt"), sympy.Function("phi", real=True)(sympy.Symbol("t", real=True))
+    for shown in (*equations(tilted), tilted.lagrangian()):
+        assert shown.has(tilt) and not shown.has(tilt.diff())
 
 
 @pytest.mark.parametrize("functions_of_time", [False, True])
@@ -563,6 +572,60 @@ def test_scene_of_sympys_expressions_has_all_functions():
     for x in (-0.3, 0.2, 1.0):
         expected = -float(potential.diff(q).subs(q, x)) / (4 / 3)
         assert scene.acceleration([x, 0.0])["q"] == pytest.approx(expected, rel=1e-13)
+
+
+@pytest.mark.parametrize("functions_of_time", [False, True])
+@pytest.mark.parametrize("control", ["s_ddot", "s_dot", "s"])
+def test_controls_of_sympys_expressions_move_coordinates(control, functions_of_time):
+    x, x_dot, s, s_dot, s_ddot = sympy.symbols("x x_dot s s_dot s_ddot")
+    keys = {"s": s, "s_dot": s_dot, "s_ddot": s_ddot}
+    if functions_of_time:
+        x, s = dynamicsymbols("x s")
+        x_dot, s_dot = x.diff(), s.diff()
+        keys["s"] = s
+    m, k = 2.0, 3.0
+    given = Scene.from_sympy(
+        "Pulled", m * (x_dot + s_dot) ** 2 / 2, k * (x**2 - s) ** 2 / 2, coordinates={x: "m"},
+        prescribed={s: "m"}, controls={keys[control]: ""}, dissipation=(x_dot - s_dot) ** 2 / 20,
+    )  # fmt: skip
+
+    class Pulled(Scene):
+        coordinates = {"x": "m"}
+        prescribed = {"s": "m"}
+        controls = {control: ""}
+
+        def kinetic(self, q, v, xp):
+            return m * (v.x + v.s) ** 2 / 2
+
+        def potential(self, q, xp):
+            return k * (q.x**2 - q.s) ** 2 / 2
+
+        def dissipation(self, q, v, u, xp):
+            return (v.x - v.s) ** 2 / 20
+
+    start = np.linspace(0.2, 0.5, len(Pulled().state_names))
+    path, expected = (scene.simulate(start, [0.4, -0.7, 0.1], 0.05) for scene in (given, Pulled()))
+    assert given.state_names == Pulled().state_names
+    np.testing.assert_allclose(path, expected, rtol=1e-13)
+
+
+def test_sympys_expressions_may_be_text():
+    given = {"coordinates": {"q": "m"}, "controls": {"f": "N"}, "applied": {"q": "f"}}
+    scene = Scene.from_sympy("Text", "m*q_dot**2/2", "k*q**2", **given, parameters={"m": 2, "k": 3.0})
+    assert scene.acceleration([1.0, 0.0], 4.0) == {"q": -1.0}
+
+
+@pytest.mark.parametrize("number", [np.array([2.0]), None, [1.0], "2"], ids=repr)
+def test_parameters_of_sympys_expressions_are_numbers(number):
+    q, q_dot, m = sympy.symbols("q q_dot m")
+    with pytest.raises(ValueError, match=re.escape(f"m must be a real number, got {number!r}")):
+        Scene.from_sympy("Odd", m * q_dot**2, q**2, coordinates={q: "m"}, parameters={m: number})
+
+
+def test_symbols_of_sympys_expressions_that_only_look_alike():
+    q, q_dot = sympy.Symbol("q", real=True), sympy.Symbol("q_dot")
+    with pytest.raises(FormulaError, match="q_dot is not the declared symbol of that name"):
+        Scene.from_sympy("Odd", q_dot**2, q**2, coordinates={q: "m"})
 
 
 @pytest.mark.parametrize(

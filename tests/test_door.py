@@ -218,7 +218,7 @@ INVALID = {
     ),
     "dissipation that is a force": (
         {"dissipation": lambda self, q, v, u, xp: -self.mass * v.x},
-        "dissipation; constant force; half of the power lost",
+        "dissipation; constant force; derivative by the velocity is the drag",
     ),
     "dissipation without velocities": (
         {"dissipation": lambda self, q, v, u, xp: self.mass * q.x**2},
@@ -351,6 +351,11 @@ DECLARED = {
         "reactions; 'wall'; prescribed",
     ),
     "ratio of unknown forces": ({"ratios": {"needed": ("push", "normal")}}, "ratios; 'normal'; reactions"),
+    "reaction named like a drive": (
+        {"reactions": {"support": "rise", "drive_s": "rise"}, "ratios": {}},
+        "two; 'drive_s'; rename; reactions",
+    ),
+    "ratio named like a reaction": ({"ratios": {"push": ("push", "support")}}, "two; 'push'; rename"),
     "ratio of one force": ({"ratios": {"needed": "push"}}, "ratios; pair"),
     "controls and modes": ({"modes": {"pushed": {"force": "N"}}}, "controls and modes"),
     "mode that is no dict": ({"controls": {}, "modes": {"pushed": "force"}}, "modes; 'pushed'"),

@@ -213,6 +213,15 @@ def test_linearisation_is_the_derivative(case):
         np.testing.assert_allclose(mine, slope, rtol=1e-7, atol=1e-7 * max(1.0, np.abs(slope).max()))
 
 
+def test_linearisation_has_floats_where_numbers_are_large():
+    class Stiff(contract_scenes.ChargedParticle):
+        def potential(self, q, xp):
+            return 1.327e20 * (q.x**2 + q.y**2)
+
+    A, B = Stiff().linearise([1.0, 0.0, 0.0, 0.0])
+    assert A.dtype == B.dtype == np.float64 and A[1, 0] == -2 * 1.327e20
+
+
 def test_held_rate_carries_what_stays_continuous():
     """M (w - v) = Σ G ṡ, and w' by differences of w along the motion with these accelerations."""
     scene = contract_scenes.Trolley()

@@ -90,6 +90,32 @@ def test_formulas_of_a_notebook():
     assert f"<msubsup>{dotted}<mn>1</mn><mn>2</mn></msubsup>" in text
 
 
+@pytest.mark.parametrize("formula", ["exp(x)", "pi*x", "exp(-x**2/alpha_1)", "exp(1)*x", "sqrt(pi)*x**3"])
+def test_formulas_with_pi_and_e(formula):
+    """SymPy's MathML has entities for them, which only browsers know."""
+    import sympy
+
+    text = html.mathml(sympy.sympify(formula), " = 0")
+    assert ("<mi>π</mi>" if "pi" in formula else "<mi>e</mi>") in text
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "tan", "atan", "tanh", "sqrt", "exp", "log"])
+def test_every_function_is_shown(name):
+    class Curved(Scene):
+        stiffness: float = parameter(1.0, "N", above=0.0)
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return v.x**2 / 2
+
+        def potential(self, q, xp):
+            return self.stiffness * xp.pi * getattr(xp, name)(2 + q.x) ** 2
+
+    shown = Checked(Curved()._repr_html_())
+    assert "π" in shown.text and "Equations of motion" in shown.text
+    assert "Curved(" not in shown.text  # the signature, which a class without a docstring gets as one
+
+
 def test_without_sympy_the_rest_is_shown(monkeypatch):
     monkeypatch.setattr(html, "find_spec", lambda name: None)
     shown = Checked(SCENES[0]()._repr_html_())

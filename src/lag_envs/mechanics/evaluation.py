@@ -98,7 +98,7 @@ class DualArray:
     __array_ufunc__ = None  # NumPy's numbers leave arithmetic to this class
 
     def __init__(self, value: Any, slope: Any) -> None:
-        self.value, self.slope = np.asarray(value), slope
+        self.value, self.slope = np.asarray(value, dtype=np.float64), slope
 
     def __add__(self, other: Any) -> DualArray:
         if isinstance(other, DualArray):
@@ -111,7 +111,8 @@ class DualArray:
         if isinstance(other, DualArray):
             slope = self.value[..., None] * other.slope + other.value[..., None] * self.slope
             return DualArray(self.value * other.value, slope)
-        return DualArray(self.value * other, np.asarray(other)[..., None] * self.slope)
+        factor = np.asarray(other, dtype=np.float64)  # whole numbers beyond 64 bits would make objects
+        return DualArray(self.value * factor, factor[..., None] * self.slope)
 
     __rmul__ = __mul__
 
@@ -127,7 +128,7 @@ class DualArray:
         return DualArray(quotient, (value[1] - quotient[..., None] * divisor[1]) / divisor[0][..., None])
 
     def __rtruediv__(self, other: Any) -> DualArray:
-        quotient = other / self.value
+        quotient = _parts(other)[0] / self.value
         return DualArray(quotient, -(quotient / self.value)[..., None] * self.slope)
 
 

@@ -87,6 +87,13 @@ class SceneLayout:
         """All coordinates, the free ones first."""
         return (*self.free, *(p.name for p in self.prescribed))
 
+    @property
+    def forces(self) -> tuple[tuple[str, str], ...]:
+        """Names of all forces, those of `reactions` first, with the coordinate that each moves or holds."""
+        named = {coordinate for _, coordinate in self.reactions}
+        driven = [p.name for p in self.at("acceleration", "rate") if p.name not in named]
+        return (*self.reactions, *((f"drive_{name}", name) for name in driven))
+
 
 def check_name(where: str, name: Any) -> str:
     """Return a name that can follow a dot in a formula, or raise a FormulaError."""
@@ -175,7 +182,7 @@ def make_layout(
         twice = next(e.name for e in kept if sum(e.name == other.name for other in kept) > 1)
         raise FormulaError(f"{of}: two entries of the state are named {twice!r}; rename a coordinate")
     forces = _reactions(of, reactions, moved)
-    return SceneLayout(
+    layout = SceneLayout(
         free=tuple(free),
         prescribed=held,
         controls=tuple(driven),
@@ -186,6 +193,14 @@ def make_layout(
         reactions=forces,
         ratios=_ratios(of, ratios, forces),
     )
+    results = [name for name, *_ in (*layout.forces, *layout.ratios)]
+    for name in results:
+        if results.count(name) > 1:
+            raise FormulaError(
+                f"{of}: two of the forces and ratios are named {name!r}; rename one in reactions or ratios "
+                "(drive_s is the force that moves a coordinate s which reactions does not name)"
+            )
+    return layout
 
 
 def _check_clashes(of: str, free: dict, moved: dict, controls: Sequence[str]) -> None:

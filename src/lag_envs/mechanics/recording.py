@@ -358,8 +358,9 @@ def _check_dissipation(scene: Any, loss: Expr) -> None:
         raise FormulaError(f"{of} contains no velocity, so it has no effect; forces belong in applied")
     if degrees and max(degrees) == 1:
         raise FormulaError(
-            f"{of} is proportional to velocities, so it would push with a constant force; return half of the "
-            "power lost, such as 0.5 * b * v.x**2; forces belong in applied"
+            f"{of} is proportional to velocities, so it would push with a constant force; return a function "
+            "whose derivative by the velocity is the drag, such as 0.5 * b * v.x**2 for b * v.x; forces "
+            "belong in applied"
         )
 
 

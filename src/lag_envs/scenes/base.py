@@ -318,9 +318,10 @@ class Scene(metaclass=SceneType):
     def forces(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the forces [N] and torques [N m] that move or hold prescribed coordinates, and ratios.
 
-        The forces in `reactions` have the names given there; the force on any other coordinate s is
-        ``drive_s``. A ratio |F|/N is infinite if N is not above 1e-12 of the weight: the contact carries no
-        load, or pulls.
+        The forces in `reactions` have the names given there. The force on any other coordinate s whose
+        acceleration or rate is a control is ``drive_s``. For a coordinate at rest, or held at a place by a
+        control, only forces named in `reactions` are returned. A ratio |F|/N is infinite if N is not above
+        1e-12 of the weight: the contact carries no load, or pulls.
 
         Parameters
         ----------
@@ -331,10 +332,7 @@ class Scene(metaclass=SceneType):
         """
         point, shape = self._point(state, control)
         layout = layout_of(self)
-        named = dict(layout.reactions)
-        for p in layout.at("acceleration", "rate"):
-            if p.name not in named.values():
-                named[f"drive_{p.name}"] = p.name
+        named = dict(layout.forces)
         forces = {k: _shaped(f, shape) for k, f in zip(named, point.force(list(named.values())), strict=True)}
         for name, friction, normal in layout.ratios:
             least = _shaped(1e-12 * point.weight(named[normal]), shape)
@@ -663,7 +661,8 @@ class Scene(metaclass=SceneType):
             The energies [J], and Rayleigh's function [W].
         coordinates, prescribed, controls : dict from symbol to str
             Free and prescribed coordinates and controls with their units. The velocity of a function of time
-            is its derivative, ``theta.diff(t)``; that of a plain symbol ``theta`` is ``theta_dot``.
+            is its derivative, ``theta.diff(t)``; that of a plain symbol ``theta`` is ``theta_dot``. A text
+            stands for the symbol of that name.
         applied : dict from symbol to expression, optional
             Generalised forces by coordinate.
         parameters : dict from symbol to float

@@ -48,6 +48,9 @@ def scene_html(scene: Any) -> str:
         f"{name} [{unit}]" for name, unit in zip(scene.control_names, scene.control_units, strict=True)
     )
     about = (inspect.getdoc(type(scene)) or "").partition("\n")[0]
+    # A dataclass without a docstring gets its signature as one.
+    if about.startswith(f"{type(scene).__name__}("):
+        about = ""
     rows = [("State", state), ("Controls", controls or "none")]
     return (
         f"<div><b>{escape(type(scene).__name__)}</b> {escape(about)}{html_table(rows)}"
@@ -114,6 +117,13 @@ def mathml(expression: Any, behind: str = "") -> str:
                 written.setAttribute("height", HEIGHT)
             digits = "mn" if index.isdigit() else "mi"
             return self._element("msub", written, self._element(digits, index)) if index else written
+
+        # SymPy writes entities for these two, which a parser of XML does not know.
+        def _print_Exp1(self, e: Any) -> Any:
+            return self._element("mi", "e")
+
+        def _print_Pi(self, e: Any) -> Any:
+            return self._element("mi", "π")
 
         def _print_Pow(self, e: Any) -> Any:
             written = super()._print_Pow(e)

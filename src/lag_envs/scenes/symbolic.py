@@ -18,6 +18,7 @@ from sympy.core.function import AppliedUndef
 
 from lag_envs.mechanics.algebra import FormulaError, RecordedFunctions
 from lag_envs.mechanics.recording import Values, parameter_names, twin
+from lag_envs.scenes.checks import check_number
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.parameters import parameter
 
@@ -90,12 +91,14 @@ def motion_symbols(scene: Scene) -> tuple[Values, Values, Values]:
 
 
 def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
-    """Return an expression with resting coordinates at their resting places."""
+    """Return an expression with resting coordinates at their places, and no rates of held ones."""
     values: dict[Any, Any] = {}
     rests = symbolic(scene).rests()
-    for p in layout_of(scene).at("rest"):
+    for p in layout_of(scene).at("rest", "place"):
         place = sympy.Function(p.name, real=True)(t)
-        values |= {place: xp.rational(rests.get(p.name, 0)), place.diff(t): 0, place.diff(t, 2): 0}
+        values |= {place.diff(t): 0, place.diff(t, 2): 0}
+        if p.level == "rest":
+            values[place] = xp.rational(rests.get(p.name, 0))
     return expression.xreplace({key: sympy.sympify(value) for key, value in values.items()})
 
 
@@ -159,11 +162,14 @@ def from_sympy(
     items = []
     for what, given in {**maps, "applied": applied or {}}.items():
         try:
-            items.append((what, tuple(dict(given).items())))
+            pairs = [(_symbol(key), value) for key, value in dict(given).items()]
         except (TypeError, ValueError):
             raise FormulaError(
                 f"{name}.{what} must be a dict from SymPy symbols, got {given!r:.60}"
             ) from None
+        if what == "parameters":
+            pairs = [(key, x if callable(x) else check_number(_name(key), x)) for key, x in pairs]
+        items.append((what, tuple(pairs)))
     formulas = tuple(
         (what, sympy.sympify(e))
         for what, e in (("kinetic", kinetic), ("potential", potential), ("dissipation", dissipation))
@@ -178,15 +184,15 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
     expressions = dict(formulas)
     named = {what: {_name(key): value for key, value in of.items()} for what, of in given.items()}
     applied = {key: sympy.sympify(value) for key, value in named["applied"].items()}
-    places: dict[Any, tuple[str, str]] = {}
+    # First the controls: one that sets a place or a rate is read as that place or rate.
+    places: dict[Any, tuple[str, str]] = {symbol: ("u", _name(symbol)) for symbol in given["controls"]}
+    places |= {symbol: ("self", _name(symbol)) for symbol in given["parameters"]}
     for symbol in (*given["coordinates"], *given["prescribed"]):
         places[symbol] = ("q", _name(symbol))
         if isinstance(symbol, AppliedUndef):
             places[sympy.Derivative(symbol, *symbol.args)] = ("v", _name(symbol))
         else:
             places[sympy.Symbol(f"{symbol.name}_dot", **symbol._assumptions_orig)] = ("v", _name(symbol))
-    places |= {symbol: ("u", _name(symbol)) for symbol in given["controls"]}
-    places |= {symbol: ("self", _name(symbol)) for symbol in given["parameters"]}
 
     def numbers(self: Any, **spaces: Any) -> dict[Any, Any]:
         spaces["self"] = self
@@ -231,6 +237,11 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
 
 def _remake(base: type[Scene], name: str, items: tuple, formulas: tuple, fields: dict) -> Scene:
     return _scene_type(base, name, items, formulas)(**fields)
+
+
+def _symbol(key: Any) -> Any:
+    """Return the symbol that a key of a dict stands for; a text stands for the symbol of that name."""
+    return sympy.Symbol(key) if isinstance(key, str) else key
 
 
 def _name(symbol: Any) -> str:
@@ -286,6 +297,11 @@ def evaluate_expression(expression: Any, values: Mapping[Any, Any], xp: Any) -> 
     if expression.func in _FUNCTIONS:
         return getattr(xp, _FUNCTIONS[expression.func])(of(expression.args[0]))
     if expression.is_Symbol or isinstance(expression, AppliedUndef | sympy.Derivative):
+        if str(expression) in map(str, values):
+            raise FormulaError(
+                f"{expression} is not the declared symbol of that name: they differ in assumptions such as "
+                "real=True; use the same symbol"
+            )
         time = " (an energy has no symbol for time)" if str(expression) == "t" else ""
         raise FormulaError(
             f"{expression} is neither a coordinate, its velocity, a control nor a parameter of this "
