@@ -20,7 +20,17 @@ import gymnasium as gym
 import numpy as np
 
 from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparameters
-from agents.run import RESULT, Run, UserError, check_numbers, fresh_seeds, known_name, own_env, reports_errors
+from agents.run import (
+    RESULT,
+    Run,
+    UserError,
+    check_numbers,
+    fresh_seeds,
+    known_name,
+    own_env,
+    reports_errors,
+    source_digest,
+)
 from agents.train import here, report_failures, show_progress
 from lag_envs.evaluation.rollout import play
 from lag_envs.options import module_parser
@@ -96,7 +106,9 @@ def open_run(args: argparse.Namespace) -> Run:
         raise UserError(f"--output must be a folder, {args.output} is not")
     hyper = zoo_hyperparameters(args.algo, env)
     steps = args.steps or int(hyper["n_timesteps"])
-    run = Run(args.output, env, args.algo, args.seed, steps, hyper, "" if env == args.env else args.env)
+    source = "" if env == args.env else args.env
+    digest = source and source_digest(source, env)
+    run = Run(args.output, env, args.algo, args.seed, steps, hyper, source, digest)
     if args.new:
         run.remove()
     elif run.load_result() is None and run.load_checkpoint() is None and run.foreign():

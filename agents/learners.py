@@ -414,7 +414,12 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
     module = import_module(OWN[run.algo][0])
     learner = module.Learner(run.env, module.Settings.of(run.hyperparameters), run.seed, run.steps)
     if content is not None:
-        learner.restore(content["learner"])
+        try:
+            learner.restore(content["learner"])
+        except Exception as error:  # whatever another environment, or another version of the learner, leads to
+            raise UserError(
+                f"{run.path(CHECKPOINT)} cannot be resumed ({error}); --new starts over"
+            ) from error
     every = run.steps / TESTS
 
     def test() -> None:

@@ -36,6 +36,7 @@ from agents.run import (
     known_name,
     own_env,
     reports_errors,
+    source_digest,
 )
 from lag_envs import TASKS, workers
 from lag_envs.options import module_parser
@@ -118,9 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a seed failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
     runs = planned_runs(args)
-    for run in runs:
-        if run.load_result() is not None:
-            print(f"{run.name}: finished before")
     parallel_map = (
         partial(on_ray, address=args.ray) if args.ray else partial(train_in_processes, jobs=args.jobs)
     )
@@ -132,6 +130,9 @@ def train_all(
 ) -> int:
     """Train the runs that are not finished, print all returns, and return the command's exit status."""
     todo = [run for run in runs if run.load_result() is None]
+    for run in runs:
+        if run not in todo:
+            print(f"{run.name}: finished before")
     failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
     print_returns([run for run in runs if run.name not in failed])
     return report_failures(failed, stopped, module, arguments)
@@ -149,6 +150,7 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
     check_numbers(args, seeds=1, first_seed=0, steps=1, jobs=1)
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
+    digests = {env: source and source_digest(source, env) for env, source in sources.items()}
     runs = []
     for (env, source), algo in product(sources.items(), algos):
         if args.env == ["all"] and not suits(algo, TASKS[env]()):
@@ -162,7 +164,7 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
             raise UserError(f"n_timesteps must be a number of steps, got {hyper.get('n_timesteps')!r}")
         for seed in range(args.first_seed, args.first_seed + args.seeds):
             folder = args.output / env / algo / f"seed{seed}"
-            runs.append(Run(folder, env, algo, seed, steps, hyper, source))
+            runs.append(Run(folder, env, algo, seed, steps, hyper, source, digests[env]))
     if args.ray:  # before anything is removed
         check_address(args.ray)
     for run in runs:

@@ -155,6 +155,13 @@ def test_a_seed_decides_everything_with_interruptions_or_without(algo, more, tmp
     assert play(ENV, load_policy(whole.folder), fresh_seeds(20)).tolist() == learnt(whole)[1]
 
 
+def test_a_checkpoint_that_does_not_fit_is_told_in_a_line(tmp_path):
+    other = make_learner(pivoted_bar.SwingUp.id)
+    make_run(tmp_path).save_checkpoint({"learner": other.state()})
+    with pytest.raises(UserError, match=r"cannot be resumed \(.*\); --new starts over"):
+        go(make_run(tmp_path))
+
+
 @pytest.mark.parametrize("frames", [1, 3])
 def test_the_policy_that_was_written_is_the_one_that_was_evaluated(frames, tmp_path):
     run = make_run(tmp_path, frames=frames)
@@ -342,7 +349,9 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
     assert "256 steps" in output and ", score " in output and "with imports, compiling" in output
     result = json.loads((tmp_path / ENV / ppo.NAME / "seed1" / RESULT).read_text())
     assert result["hyperparameters"]["gamma"] == 0.9 and result["trained"] == 256
-    assert ppo.main(given) == 0 and " steps, " not in capsys.readouterr().out  # finished before
+    assert ppo.main(given) == 0
+    output = capsys.readouterr().out
+    assert " steps, " not in output and output.count("finished before\n") == 2
     assert ppo.main([ENV, "--output", str(tmp_path), "--steps", "256"]) == 2
     assert "other hyperparameters (" in capsys.readouterr().err
 

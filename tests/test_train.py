@@ -23,7 +23,7 @@ from trainings import go, kill_and_interrupt, short_evaluations
 from agents import learners, run, train
 from agents.learners import ALGORITHMS, load_policy, zoo_hyperparameters
 from agents.run import Run, UserError
-from lag_envs import cli
+from lag_envs import cli, own_files
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import OFF_POLICY, as_yaml
 from lag_envs.leaderboard.networks import bin_centres
@@ -580,3 +580,70 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
 def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):
     status = train.main([*arguments, "--steps", "100", "--output", str(tmp_path)])
     assert status in (1, 2) and message in "".join(capsys.readouterr())
+
+
+SLED = """
+from sled import Sled
+
+import lag_envs
+from lag_envs.tasks import Task
+
+
+class Slide(Task):
+    id = "OwnSlide-v0"
+    scene = Sled
+    interval, steps = 0.1, 30
+    action = {"push": 1.0}
+    start = {"x": 0.5}
+
+    def observe(self, after, target, xp):
+        return {"x": after.x, "x_dot": after.x_dot}
+
+    def reward(self, before, after, control, target, dt, xp):
+        return -after.x**2
+
+
+lag_envs.register(Slide)
+"""
+SCENE = """
+from lag_envs.scenes import Scene
+
+
+class Sled(Scene):
+    coordinates = {"x": "m"}
+    controls = {"push": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2
+
+    def potential(self, q, xp):
+        return 0.0
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.push}
+"""
+
+
+@pytest.mark.parametrize("edited", ["slide.py", "sled.py"])
+@pytest.mark.parametrize("given", ["slide.py", "slide.py:Slide", "slide:OwnSlide-v0"])
+def test_a_task_that_was_edited_is_another_one(given, edited, tmp_path, monkeypatch):
+    (tmp_path / "slide.py").write_text(SLED)
+    (tmp_path / "sled.py").write_text(SCENE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    args = train.parser().parse_args([given, "--algo", "fast_ppo"])
+    try:
+        (begun,) = train.planned_runs(args)
+        begun.save_checkpoint({})
+        assert train.planned_runs(args)[0].settings == begun.settings
+        (tmp_path / edited).write_text((tmp_path / edited).read_text() + "\n")
+        with pytest.raises(UserError, match=f"pkl belongs to another version of {given}; --new starts over"):
+            train.planned_runs(args)
+        args.new = True
+        assert train.planned_runs(args)[0].digest != begun.digest
+    finally:
+        own_files.load_module.cache_clear()
+        gym.registry.pop("OwnSlide-v0", None)
+        for name in ("slide", "sled", "own_slide"):
+            sys.modules.pop(name, None)
+    assert "digest" not in make_run(tmp_path).settings  # a task of the package is known by its id
