@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter
 
 import lag_envs.hyperparams
@@ -354,6 +355,9 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
 
         def _on_step(self) -> bool:
             run.trained = self.num_timesteps
+            if not np.isfinite(self.locals["rewards"]).all():
+                check_weights(run, self.model.policy.parameters())
+                check_rewards(run.env, self.locals["rewards"])
             run.stop_clock()
             show(run)
             run.start_clock()
@@ -370,11 +374,10 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             run.stop_clock()
             check_weights(run, self.model.policy.parameters())
             content = freeze(self.model)
-            seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
             normalise = self.model.get_vec_normalize_env()
-            mean = play(run.env, policy_of(run.settings, self.model, normalise), seeds).mean()
+            mean = tested_return(run.env, policy_of(run.settings, self.model, normalise))
             run.trained = self.last = self.num_timesteps
-            run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
+            run.curve.append((run.trained, round(run.seconds, 3), mean))
             if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
                 best = {**content, "buffer": None, "trained": run.trained}
             run.save_checkpoint({**content, "best": best})
@@ -395,6 +398,20 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             raise
         watch.keep()
     finish_training(run, best)
+
+
+def tested_return(env_id: str, policy: Any) -> float:
+    """Return a policy's mean return in the episodes of a test while training."""
+    returns = play(env_id, policy, range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES))
+    check_rewards(env_id, returns)
+    return float(returns.mean())
+
+
+def check_rewards(env_id: str, rewards: NDArray[Any]) -> None:
+    """Raise a UserError for a reward that is not a finite number; the learner would seem to diverge."""
+    wrong = rewards[~np.isfinite(rewards)]
+    if wrong.size:
+        raise UserError(f"the reward of {env_id} is {wrong[0]}; it must be a finite number in every state")
 
 
 def check_weights(run: Run, weights: Iterable[Any], error: Exception | None = None) -> None:
@@ -423,8 +440,7 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
     every = run.steps / TESTS
 
     def test() -> None:
-        seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-        mean = float(play(run.env, learner.policy, seeds).mean())
+        mean = tested_return(run.env, learner.policy)
         run.curve.append((run.trained, round(run.seconds, 3), mean))
         run.save_checkpoint({"learner": learner.state()})
         tested(run)
@@ -462,6 +478,7 @@ def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
     """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
+    check_rewards(run.env, returns)
     known, place = known_returns(run.env), machine()
     result = {
         **run.settings,

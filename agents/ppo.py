@@ -33,7 +33,7 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
-from agents.learners import LearnerSettings, trainable
+from agents.learners import LearnerSettings, check_rewards, trainable
 from agents.run import CHECKPOINT, first_training_seed, reports_errors
 from agents.train import add_run_options, here, planned_runs, train_all
 from lag_envs.envs.stagger import stagger
@@ -262,7 +262,7 @@ class Learner:
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
-        self.settings, self.steps, self.trained = settings, steps, 0
+        self.env_id, self.settings, self.steps, self.trained = env_id, settings, steps, 0
         self.rng = np.random.default_rng(seed)
         task = trainable(env_id)
         formulas = task.formulas
@@ -297,6 +297,7 @@ class Learner:
     def iterate(self) -> None:
         """Collect experience and learn from it."""
         rollout = self.collect()
+        check_rewards(self.env_id, rollout.rewards)
         self.update(rollout, *self.advantages(rollout))
         self.trained += rollout.rewards.size
 

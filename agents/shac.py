@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
-from agents.learners import LearnerSettings, trainable
+from agents.learners import LearnerSettings, check_rewards, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.torch import Step
@@ -112,7 +112,7 @@ class Learner:
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
-        self.settings, self.steps, self.trained = settings, steps, 0
+        self.env_id, self.settings, self.steps, self.trained = env_id, settings, steps, 0
         self.rng = np.random.default_rng(seed)
         self.task = trainable(env_id)
         try:
@@ -147,6 +147,7 @@ class Learner:
     def iterate(self) -> None:
         """Collect a window and learn from it."""
         window = self.collect()
+        check_rewards(self.env_id, window.rewards)
         slopes = self.gradients(window)
         self.update(window, slopes)
         if self.settings.critic:

@@ -267,6 +267,19 @@ def test_rollouts_are_what_happened():
     assert len({tuple(np.flatnonzero(row)) for row in found.over}) > 2  # staggered
 
 
+def test_a_reward_that_is_no_number_is_named(monkeypatch):
+    learner = make_learner()
+    step = learner.envs.step
+
+    def undefined(actions):
+        observation, reward, *rest = step(actions)
+        return observation, np.where(np.arange(8) == 3, np.nan, reward), *rest
+
+    monkeypatch.setattr(learner.envs, "step", undefined)
+    with pytest.raises(UserError, match=f"the reward of {ENV} is nan; it must be a finite number"):
+        learner.iterate()
+
+
 def test_frames_are_the_last_observations_of_an_episode(monkeypatch):
     learner, stepped = make_learner(episode_share=0.02, frames=3), []
     wide, step = learner.observation.shape[1] // 3, learner.envs.step

@@ -23,7 +23,7 @@ from trainings import go, kill_and_interrupt, short_evaluations
 from agents import learners, run, train
 from agents.learners import ALGORITHMS, load_policy, zoo_hyperparameters
 from agents.run import Run, UserError
-from lag_envs import cli, own_files
+from lag_envs import cli, own_files, sb3
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import OFF_POLICY, as_yaml
 from lag_envs.leaderboard.networks import bin_centres
@@ -222,6 +222,28 @@ def test_a_training_that_diverges_is_told_in_a_line(algo, tmp_path):
     assert re.fullmatch(
         r"the training diverged \(seed 3, after [0-9]+ steps\): lower learning_rate", failure.reason
     )
+
+
+@pytest.mark.parametrize(("algo", "returns"), [("ppo", -np.inf), ("fast_ppo", np.nan)])
+def test_a_reward_that_is_no_number_is_not_called_divergence(algo, returns, tmp_path, monkeypatch):
+    monkeypatch.setattr(learners, "play", lambda env, policy, seeds: np.full(len(seeds), returns))
+    hyper = zoo_hyperparameters(algo, ENV) | SHORT["ppo"]
+    with pytest.raises(UserError, match=f"the reward of {ENV} is {returns}; it must be a finite number"):
+        go(Run(tmp_path, ENV, algo, 3, 400, hyper))
+
+
+@pytest.mark.parametrize("algo", ["ppo", "td3"])
+def test_nor_is_one_that_only_exploration_meets(algo, tmp_path, monkeypatch):
+    step = sb3.VecEnv.step_wait
+
+    def undefined(self):
+        observations, rewards, *rest = step(self)
+        rewards[1] = np.nan
+        return observations, rewards, *rest
+
+    monkeypatch.setattr(sb3.VecEnv, "step_wait", undefined)
+    with pytest.raises(UserError, match=f"the reward of {ENV} is nan"):
+        go(make_run(tmp_path, algo, normalize=True))
 
 
 # --- damaged and foreign files ---
