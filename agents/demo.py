@@ -19,7 +19,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparameters
+from agents.learners import LEARNERS, check_trainable, learner_label, load_policy, zoo_hyperparameters
 from agents.run import (
     RESULT,
     Run,
@@ -104,6 +104,7 @@ def open_run(args: argparse.Namespace) -> Run:
     check_numbers(args, seed=0, steps=1)
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
+    check_trainable(args.algo, env)
     hyper = zoo_hyperparameters(args.algo, env)
     steps = args.steps or int(hyper["n_timesteps"])
     source = "" if env == args.env else args.env

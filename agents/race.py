@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from agents import learners
 from agents.analysis import LEVELS, first_reached
-from agents.learners import LEARNERS, learner_label, suits, zoo_hyperparameters
+from agents.learners import LEARNERS, check_suits, learner_label, zoo_hyperparameters
 from agents.run import (
     Run,
     UserError,
@@ -32,7 +32,7 @@ from agents.run import (
     known_name,
     reports_errors,
 )
-from lag_envs import TASKS, store, workers
+from lag_envs import store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
 from lag_envs.options import module_parser, new_file, new_picture
@@ -107,13 +107,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"a race is on ids of the package, which have a scale of scores, got {args.env}; agents.train "
             "trains on tasks of your own"
         )
-    task = TASKS[check_env(args.env)]()
+    check_env(args.env)
     if known_returns(args.env) is None:
         raise UserError(f"{args.env} has no scale of scores yet; python -m agents.scale measures one")
     names = [known_name("learner", name, LEARNERS) for name in dict.fromkeys(args.learners)]
-    if unfit := [name for name in names if not suits(name, task)]:
-        fit = ", ".join(name for name in LEARNERS if suits(name, task))
-        raise UserError(f"{unfit[0]} does not learn actions of {args.env}'s kind; available: {fit}")
+    for name in names:
+        check_suits(name, args.env)
     check_numbers(args, seeds=1, first_seed=0, steps=1)
     files = [file for file in (args.output, args.picture) if file]
     if len({file.resolve() for file in files}) < len(files):

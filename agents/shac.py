@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
-from agents.learners import LearnerSettings, check_rewards, trainable
+from agents.learners import Count, LearnerSettings, check_rewards, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.torch import Step
@@ -47,8 +47,8 @@ class Settings(LearnerSettings):
     learner = NAME
 
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
-    n_envs: int = Field(ge=1, description="environments stepped together")
-    n_steps: int = Field(ge=1, description="steps of a window")
+    n_envs: Count = Field(description="environments stepped together")
+    n_steps: Count = Field(description="steps of a window")
     learning_rate: float = Field(ge=0, description="of the policy at the start; it falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")

@@ -24,7 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from agents.learners import EPISODES, LEARNERS, TESTS, suits, train_rest, zoo_hyperparameters
+from agents.learners import EPISODES, LEARNERS, TESTS, check_trainable, suits, train_rest, zoo_hyperparameters
 from agents.run import (
     CHECKPOINT,
     MODEL,
@@ -56,7 +56,8 @@ Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; finished
 A run resumes from its last checkpoint: for fast_ppo, shac and cloning with the same result as without the
 interruption, for the others with different episodes.
 Policies of SAC, TD3, TQC and DQN get better and worse while they learn: the one that did best in a test, on
-separate episodes, is kept. For PPO it is the last one.
+separate episodes, is kept. For PPO it is the last one. Tests and results are of the environment with its own
+parameters; a TimeLimit among the hyperparameters shortens the episodes of training alone.
 
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
@@ -155,10 +156,11 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
     for (env, source), algo in product(sources.items(), algos):
         if args.env == ["all"] and not suits(algo, TASKS[env]()):
             continue
+        check_trainable(algo, env)
         hyper = {**zoo_hyperparameters(algo, env, args.config), **changed}
         try:
             steps = args.steps or int(float(hyper["n_timesteps"]))
-        except (KeyError, ValueError, TypeError):
+        except (KeyError, ValueError, TypeError, OverflowError):
             steps = 0
         if steps < 1:
             raise UserError(f"n_timesteps must be a number of steps, got {hyper.get('n_timesteps')!r}")

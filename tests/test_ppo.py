@@ -375,6 +375,10 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
         (["PivotedBra-v0"], "did you mean PivotedBar-v0"),
         ([ENV, "--gamma", "1.5"], "gamma: Input should be less than or equal to 1, got 1.5"),
         ([ENV, "--frames", "0"], "frames: Input should be greater than or equal to 1, got 0"),
+        (
+            [ENV, "--n-envs", "100000000"],
+            "n_envs: Input should be less than or equal to 100000, got 100000000",
+        ),
         ([ENV, "--actor", "0"], "actor.0: Input should be greater than 0, got 0"),
         ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = 6144, got 1000\n"),
     ],

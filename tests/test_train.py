@@ -28,6 +28,8 @@ from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import OFF_POLICY, as_yaml
 from lag_envs.leaderboard.networks import bin_centres
 from lag_envs.tasks import TASKS, incline
+from lag_envs.tasks.arm import Reach
+from lag_envs.tasks.cart_pole import CartPoleExact
 
 ROOT = Path(__file__).parents[1]
 ENV = incline.Tilt.id
@@ -206,10 +208,34 @@ def test_learners_refuse_what_they_do_not_know(tmp_path):
         (f"{ENV}: {{gamma: high}}", f"entry {ENV}: gamma: Input should be a valid number, got 'high'"),
         (f"{ENV}: {{n_envs: 2.5}}", "n_envs: Input should be a valid integer, got 2.5"),
         (f"{ENV}: {{policy: 1}}", "policy: Input should be a valid string, got 1"),
+        (f"{ENV}: {{n_envs: 0}}", "n_envs: Input should be greater than or equal to 1, got 0"),
+        (
+            f"{ENV}: {{n_envs: 1000000000}}",
+            "n_envs: Input should be less than or equal to 100000, got 1000000000",
+        ),
+        (f"{ENV}: {{frame_stack: -1}}", "frame_stack: Input should be greater than or equal to 1, got -1"),
+        (f"{ENV}: {{normalize: {{foo: 1}}}}", "normalize has no hyperparameter 'foo'; available: training"),
+        (f"{ENV}: {{normalize: {{clip_obs: x}}}}", "clip_obs: Input should be a valid number, got 'x'"),
+        (f"{ENV}: {{normalize: {{gamma: 0.9}}}}", "normalize has no hyperparameter 'gamma'"),
+        (f"{ENV}: {{normalize: yes please}}", "normalize: Input should be a valid boolean, got 'yes please'"),
+        (
+            f"{ENV}: {{env_kwargs: {{mass: 1}}}}",
+            "env_kwargs would change the environment of training, but not",
+        ),
+        (f"{ENV}: {{env_wrapper: a.B}}", "env_wrapper: Input should be a valid list, got 'a.B'"),
+        (
+            f"{ENV}: {{env_wrapper: [{{{learners.TIME_LIMIT}: {{max_episode_steps: abc}}}}]}}",
+            "TimeLimit: max_episode_steps: Input should be a valid integer, got 'abc'",
+        ),
+        (
+            f"{ENV}: {{vec_env_wrapper: [{{{learners.SCALE}: {{factor: abc}}}}]}}",
+            "ScaledReward: factor: Input should be a valid number, got 'abc'",
+        ),
     ):
         file.write_text(text)
         with pytest.raises(UserError, match=re.escape(message)):
             zoo_hyperparameters("ppo", ENV, file)
+    file.write_text(f"{ENV}: {{policy: 1}}")
     with pytest.raises(UserError, match=r"bad.yml, entry .*: settings of fast_ppo: policy is an unknown key"):
         zoo_hyperparameters("fast_ppo", ENV, file)
 
@@ -421,11 +447,22 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
+        ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac does not learn actions of CartPoleExact-v0's kind"),
+        (
+            [Reach.id, "--algo", "dqn"],
+            f"dqn does not learn actions of {Reach.id}'s kind; available: ppo, sac",
+        ),
     ],
 )
 def test_mistakes_are_named(arguments, message, command):
     status, output = command(*arguments)
     assert status == 2 and message in output and output.startswith("python -m agents.train: error:")
+
+
+def test_steps_without_an_end_are_refused(command, config):
+    config.write_text(f"{ENV}: {{n_timesteps: .inf, policy: MlpPolicy}}")
+    status, output = command(ENV, "--config", str(config))
+    assert status == 2 and "n_timesteps must be a number of steps, got inf" in output
 
 
 @pytest.mark.parametrize(
@@ -592,16 +629,14 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
-        slow(
-            [f"{SEVERAL}:Switched", "--algo", "sac"],
-            "sac does not take the hyperparameters of OwnSwitched-v0",
-        ),
-        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn needs a single control with discrete actions"),
+        slow([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not learn actions of OwnSwitched-v0's kind"),
+        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn does not learn actions of OwnCrane-v0's kind"),
+        slow([f"{SEVERAL}:Drift"], "OwnDrift-v0 has no control: there is nothing to learn"),
     ],
 )
 def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):
     status = train.main([*arguments, "--steps", "100", "--output", str(tmp_path)])
-    assert status in (1, 2) and message in "".join(capsys.readouterr())
+    assert status == 2 and message in "".join(capsys.readouterr())
 
 
 SLED = """
