@@ -33,6 +33,8 @@ SCHEMA = 1
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
+#: There are so many seeds of trainings, see `first_training_seed`.
+SEEDS = 1000
 #: What a checkpoint begins with; the digest of the rest follows.
 DIGEST = b"sha256:"
 #: Types of the entries that are read from a result.
@@ -51,6 +53,16 @@ def fresh_seeds(episodes: int) -> range:
 def first_training_seed(seed: int) -> int:
     """Return the seed of a training's first environment: another training has other episodes throughout."""
     return 1_000_000 * seed % FIRST_FRESH_SEED
+
+
+def training_seeds(first: int, count: int) -> range:
+    """Return so many seeds of trainings, or raise a UserError if one would repeat another's episodes."""
+    if first + count > SEEDS:
+        raise UserError(
+            f"seeds of trainings must lie below {SEEDS}, for each to have episodes of its own; got up to "
+            f"{first + count - 1}"
+        )
+    return range(first, first + count)
 
 
 @dataclass
@@ -216,6 +228,11 @@ def read_result(file: Path) -> dict[str, Any]:
 
 def check_env(env_id: str) -> str:
     """Return the id of an environment of the package, or raise a UserError that suggests similar ids."""
+    if own_files.is_file(env_id) or ":" in env_id:
+        raise UserError(
+            f"this command is for ids of the package, got {env_id}; agents.train and agents.ppo train on "
+            "tasks of your own"
+        )
     return known_name("environment", env_id, TASKS)
 
 

@@ -3,10 +3,18 @@
 The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing has to be tried out. In
 each iteration the policy acts for a window of some steps (`Learner.collect`), the derivatives of all later
 rewards in the window with respect to each action are computed (`Learner.gradients`), and the policy follows
-the gradient (`Learner.update`). A critic estimates the rewards after the window. The algorithm is that of
-[1]_, with one addition: at each step, derivatives larger than `max_slope` are scaled back to it. Without a
-critic, and with windows as long as episodes, it is back-propagation through time, also called analytic policy
-gradients.
+the gradient (`Learner.update`). A critic estimates the rewards after the window. Without a critic, and with
+windows as long as episodes, it is back-propagation through time, also called analytic policy gradients.
+
+The algorithm follows [1]_, but differs in more than details:
+
+- At each step, derivatives larger than `max_slope` are scaled back to it.
+- The policy is deterministic, not a normal distribution: nothing is explored but what starts and kicks bring.
+- Actions beyond their limits are clipped, and moved back towards them, never further out.
+- Each action follows the gradient of the rewards after it, discounted from that action on. In [1]_ they are
+  discounted from the window's start, so that late actions in a window count less.
+- The critic's targets are its own values; [1]_ takes them from a copy that follows slowly.
+- A share of the episodes starts in random states (`random_starts`).
 
 For PyTorch a window is one batch. The derivatives of all its steps are computed at once, because the states
 are known by then; the backward pass is only a recursion of small matrices in NumPy.

@@ -466,9 +466,9 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     given[2], given[4] = "3", "2"
     assert tune.main(given) == 0
     output = capsys.readouterr().out
-    assert output.count("setting 0, seed 0: ") == 1 and output.count("setting 0, seed 1: ") == 1
+    assert output.count("setting 0, seed 500: ") == 1 and output.count("setting 0, seed 501: ") == 1
     second = json.loads(file.read_text())["settings"]
-    assert [[r["seed"] for r in s["runs"]] for s in second] == [[0, 1]] * 3
+    assert [[r["seed"] for r in s["runs"]] for s in second] == [[500, 501]] * 3
     assert [s["runs"][0] for s in second[:2]] == [s["runs"][0] for s in first]
     best = max(second, key=lambda s: sum(r["return"] for r in s["runs"]))
     assert output.splitlines()[-5].split()[0] == str(best["number"])  # the row below the head

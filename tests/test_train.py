@@ -27,6 +27,7 @@ from lag_envs import cli, own_files, sb3
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import OFF_POLICY, as_yaml
 from lag_envs.leaderboard.networks import bin_centres
+from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS, incline
 from lag_envs.tasks.arm import Reach
 from lag_envs.tasks.cart_pole import CartPoleExact
@@ -446,6 +447,8 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--algo", "sacc"], "did you mean sac"),
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
+        ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, for each to have episodes"),
+        ([ENV, "--seeds", "1001"], "episodes of its own; got up to 1000"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
         ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac does not learn actions of CartPoleExact-v0's kind"),
         (
@@ -506,6 +509,14 @@ def test_only_what_may_succeed_later_is_resumed(capsys):
         assert ("a failed: no such luck" in output.err) == ("a" in failed)
         resumed = re.search(f"To resume: .* -m agents.train {ENV}\n", output.out)
         assert bool(resumed) == (stopped or "b" in failed)
+
+
+def test_digits_are_as_many_as_the_standard_error_allows():
+    known = known_returns(ENV)
+    returns = known.random + (known.best - known.random) * np.array([0.8, 1.0, 1.0, 0.8])
+    mean, value = train.with_errors(ENV, returns)
+    assert value == "0.900 ± 0.058" and re.fullmatch(r"\d+\.\d ± \d+\.\d|\d+ ± \d\d", mean)
+    assert train.with_errors("OwnDrift-v0", [1.0, 1.0]) == ("1.00 ± 0.00", "")
 
 
 def test_a_missing_ray_is_named(command, config):
