@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from pydantic import Field, PositiveInt
 
-from agents.learners import LearnerSettings, trainable
+from agents.learners import Count, LearnerSettings, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.controllers import build
@@ -37,8 +37,8 @@ class Settings(LearnerSettings):
 
     controller: str = Field(description="name of the controller; empty: the first that acts without a plan")
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
-    n_envs: int = Field(ge=1, description="environments stepped together")
-    n_steps: int = Field(ge=1, description="steps of each environment between updates")
+    n_envs: Count = Field(description="environments stepped together")
+    n_steps: Count = Field(description="steps of each environment between updates")
     n_updates: int = Field(ge=1, description="minibatches of an update")
     batch_size: int = Field(ge=1, description="steps of a minibatch, drawn from all collected data")
     learning_rate: float = Field(ge=0, description="of Adam at the start; it falls linearly to 0")

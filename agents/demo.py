@@ -19,17 +19,27 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.learners import LEARNERS, learner_label, load_policy, zoo_hyperparameters
-from agents.run import RESULT, Run, UserError, check_numbers, fresh_seeds, known_name, own_env, reports_errors
-from agents.train import here, report_failures, show_progress
+from agents.learners import LEARNERS, check_trainable, learner_label, load_policy, zoo_hyperparameters
+from agents.run import (
+    RESULT,
+    Run,
+    UserError,
+    check_numbers,
+    fresh_seeds,
+    known_name,
+    own_env,
+    reports_errors,
+    source_digest,
+    training_seeds,
+)
+from agents.train import here, report_failures, show_progress, with_errors
 from lag_envs.evaluation.rollout import play
-from lag_envs.options import module_parser
+from lag_envs.options import module_parser, new_folder
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
 from lag_envs.tasks.registration import make_task
 
-DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
 EPILOG = """files in the output folder:
   model.zip            the policy: agents.learners.load_policy reads it
@@ -63,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, default=0, help="seed of training (default %(default)s)")
     p.add_argument("--steps", type=int, help="environment steps to train for, in all")
     p.add_argument(
-        "--output", type=Path, default=DEFAULT_FOLDER, metavar="FOLDER", help="default %(default)s"
+        "--output", type=new_folder, default="runs/demo", metavar="FOLDER", help="default %(default)s"
     )
     p.add_argument("--new", action="store_true", help="start over, overwriting the run in the output folder")
     p.add_argument("--no-video", action="store_true", help="make no video")
@@ -92,11 +102,13 @@ def open_run(args: argparse.Namespace) -> Run:
     env = own_env(args.env)
     known_name("algorithm", args.algo, LEARNERS)
     check_numbers(args, seed=0, steps=1)
-    if args.output.exists() and not args.output.is_dir():
-        raise UserError(f"--output must be a folder, {args.output} is not")
+    training_seeds(args.seed, 1)
+    check_trainable(args.algo, env)
     hyper = zoo_hyperparameters(args.algo, env)
     steps = args.steps or int(hyper["n_timesteps"])
-    run = Run(args.output, env, args.algo, args.seed, steps, hyper, "" if env == args.env else args.env)
+    source = "" if env == args.env else args.env
+    digest = source and source_digest(source, env)
+    run = Run(args.output, env, args.algo, args.seed, steps, hyper, source, digest)
     if args.new:
         run.remove()
     elif run.load_result() is None and run.load_checkpoint() is None and run.foreign():
@@ -130,12 +142,11 @@ def report(run: Run, video: bool) -> None:
     }
     write_file(run.path("comparison.json"), json.dumps(comparison, indent=1) + "\n")
 
-    print(f"\nReturns over {EPISODES} fresh episodes of {run.env}")
-    rows = [("", "mean", "lowest", "highest", "score")]
+    print(f"\nReturns over {EPISODES} fresh episodes of {run.env}, with standard errors over episodes")
+    rows = [("", "mean ± error", "lowest", "highest", "score ± error")]
     for name, r in sorted(returns.items(), key=lambda item: -item[1].mean()):
-        part = score(run.env, r.mean())
-        tail = "" if part is None else f"{part:.3f}"
-        rows.append((name, f"{r.mean():.2f}", f"{r.min():.2f}", f"{r.max():.2f}", tail))
+        mean, value = with_errors(run.env, r)
+        rows.append((name, mean, f"{r.min():.2f}", f"{r.max():.2f}", value))
     print("\n".join(aligned(rows)))
     if known := known_returns(run.env):
         ends = f"0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g})"

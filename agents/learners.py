@@ -17,10 +17,11 @@ from copy import deepcopy
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, PositiveInt, TypeAdapter
 
 import lag_envs.hyperparams
 from agents.run import (
@@ -66,14 +67,21 @@ TEST_EPISODES, EPISODES = 20, 100
 TESTS = 16
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 SCALE = "lag_envs.sb3.ScaledReward"
-#: The argument of each wrapper that is known.
-WRAPPERS = {TIME_LIMIT: "max_episode_steps", DISCRETISE: "bins", SCALE: "factor"}
+#: Numbers of environments, of steps between updates, and of frames: more would hardly fit into any memory.
+Count = Annotated[int, Field(ge=1, le=100_000)]
+#: The argument of each wrapper that is known, and its type.
+WRAPPERS: Mapping[str, tuple[str, Any]] = {
+    TIME_LIMIT: ("max_episode_steps", PositiveInt),
+    DISCRETISE: ("bins", Annotated[int, Field(ge=2, le=1000)]),
+    SCALE: ("factor", float),
+}
 #: The Zoo's hyperparameters that are not arguments of a learner's class; with their types, if numbers.
-ZOO: Mapping[str, type | None] = dict.fromkeys(
-    ("n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs", "noise_type")
-) | {"n_envs": int, "noise_std": float, "frame_stack": int}
-#: Arguments of a learner's class that are no hyperparameters.
+ZOO: Mapping[str, Any] = dict.fromkeys(
+    ("n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "noise_type")
+) | {"n_envs": Count, "noise_std": float, "frame_stack": Count}
+#: Arguments of a learner's class, and of `VecNormalize`, that are no hyperparameters.
 GIVEN = ("env", "seed", "device", "tensorboard_log", "action_noise", "_init_setup_model")
+GIVEN_TO_NORMALISE = ("venv", "gamma")
 #: A training with a larger weight has diverged.
 LARGEST_WEIGHT = 1e6
 #: Libraries whose versions are stored in a result.
@@ -135,26 +143,84 @@ def check_hyperparameters(algo: str, hyperparameters: Mapping[str, Any]) -> None
     if algo in OWN:
         import_module(OWN[algo][0]).Settings.of(hyperparameters)
         return
-    arguments = inspect.signature(learner(algo)).parameters
-    known = {name: a.annotation for name, a in arguments.items() if name not in GIVEN} | ZOO
-    for name, value in hyperparameters.items():
-        if name not in known:
-            raise UserError(f"{algo} has no hyperparameter {name!r}; {hint(str(name), known)}")
-        if (kind := known[name]) in (bool, int, float) or name == "policy":
-            strict = ConfigDict(strict=True, allow_inf_nan=False)
-            try:
-                checked(TypeAdapter(str if name == "policy" else kind, config=strict), value)
-            except ValueError as error:
-                raise UserError(f"{name}: {error}") from error
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    if "env_kwargs" in hyperparameters:
+        raise UserError(
+            "env_kwargs would change the environment of training, but not that of tests and results; "
+            "register the task with these parameters, under an id of its own"
+        )
+    check_arguments(algo, hyperparameters, types_of(learner(algo), GIVEN) | ZOO | {"policy": str})
+    if isinstance(which := hyperparameters.get("normalize", False), dict):
+        check_arguments("normalize", which, types_of(VecNormalize, GIVEN_TO_NORMALISE))
+    else:
+        check_type("normalize", which, bool)
+    asked_wrappers(hyperparameters)
     for name in ("n_timesteps", "policy"):
         if name not in hyperparameters:
             raise UserError(f"{name} is missing; `lag-envs hyperparams {algo}` prints complete entries")
 
 
+def types_of(function: Any, given: Iterable[str]) -> dict[str, Any]:
+    """Return the types of a function's arguments, by name, without those that are given."""
+    arguments = inspect.signature(function).parameters
+    return {name: a.annotation for name, a in arguments.items() if name not in given}
+
+
+def check_arguments(owner: str, values: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    """Raise a UserError for an unknown argument, or one of another type, if its type is a plain one."""
+    for name, value in values.items():
+        if name not in known:
+            raise UserError(f"{owner} has no hyperparameter {name!r}; {hint(str(name), known)}")
+        if known[name] in (bool, int, float, str, Count):
+            check_type(name, value, known[name])
+
+
+def check_type(name: str, value: Any, kind: Any) -> None:
+    """Raise a UserError for a value of another type."""
+    try:
+        checked(TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False)), value)
+    except ValueError as error:
+        raise UserError(f"{name}: {error}") from error
+
+
+def asked_wrappers(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the argument of each wrapper that is asked for, or raise a UserError."""
+    asked: dict[str, Any] = {}
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        wrappers = hyperparameters.get(key) or []
+        check_type(key, wrappers, list)
+        for wrapper in wrappers:
+            name, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
+            if name not in WRAPPERS:
+                raise UserError(f"wrapper {name} is not known here; {', '.join(WRAPPERS)} are")
+            argument, kind = WRAPPERS[name]
+            if not isinstance(arguments, dict) or list(arguments) != [argument]:
+                raise UserError(f"wrapper {name} needs its argument, as in {name}: {{{argument}: ...}}")
+            check_type(f"wrapper {name}: {argument}", arguments[argument], kind)
+            asked[name] = arguments[argument]
+    return asked
+
+
 def suits(algo: str, task: Task) -> bool:
     """Return whether a learner supports a task's kind of actions: discrete or continuous."""
-    choices = bool(task.formulas.choices)
-    return choices if algo == "dqn" else not (choices and algo in (*OFF_POLICY, "shac", "cloning"))
+    choices = task.formulas.choices
+    return len(choices) == 1 if algo == "dqn" else not (choices and algo in (*OFF_POLICY, "shac", "cloning"))
+
+
+def check_suits(algo: str, env_id: str) -> None:
+    """Raise a UserError for a learner that does not support an environment's kind of actions."""
+    task = make_task(env_id)
+    if not suits(algo, task):
+        fit = ", ".join(name for name in LEARNERS if suits(name, task))
+        raise UserError(f"{algo} does not learn actions of {env_id}'s kind; available: {fit}")
+
+
+def check_trainable(algo: str, env_id: str) -> None:
+    """Raise a UserError for a learner and an environment that do not go together."""
+    single = trainable(env_id).formulas.actions == 1
+    if not (algo == "dqn" and single):  # it splits a continuous control into bins
+        check_suits(algo, env_id)
 
 
 class LearnerSettings(Strict):
@@ -209,22 +275,12 @@ def make_envs(run: Run, normalise: Any = None) -> Any:
     from lag_envs.sb3 import DiscreteActions, ScaledReward, make_vec_env
 
     hyper = run.hyperparameters
-    options = dict(hyper.get("env_kwargs", {}))
-    task = make_task(run.env, **options)
+    options: dict[str, Any] = {}
+    task, asked = trainable(run.env), asked_wrappers(hyper)
     steps = task.limit
-    asked: dict[str, Any] = {}
-    for wrapper in [*hyper.get("env_wrapper", []), *hyper.get("vec_env_wrapper", [])]:
-        name, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
-        if name not in WRAPPERS:
-            raise UserError(f"wrapper {name} is not known here; {', '.join(WRAPPERS)} are")
-        if not isinstance(arguments, dict) or list(arguments) != [WRAPPERS[name]]:
-            raise UserError(f"wrapper {name} needs its argument, as in {name}: {{{WRAPPERS[name]}: ...}}")
-        (asked[name],) = arguments.values()
     bins, factor = asked.get(DISCRETISE), asked.get(SCALE)
     if TIME_LIMIT in asked:
         options["max_episode_steps"], steps = asked[TIME_LIMIT], min(steps, asked[TIME_LIMIT])
-    if steps == math.inf:
-        raise UserError(f"the episodes of {run.env} have no end; give it a duration, or a TimeLimit to train")
     if bins and (task.formulas.choices or task.formulas.actions > 1):
         raise UserError(
             f"{run.algo} needs a single control with discrete actions, which {run.env} does not have; try ppo"
@@ -354,6 +410,9 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
 
         def _on_step(self) -> bool:
             run.trained = self.num_timesteps
+            if not np.isfinite(self.locals["rewards"]).all():
+                check_weights(run, self.model.policy.parameters())
+                check_rewards(run.env, self.locals["rewards"])
             run.stop_clock()
             show(run)
             run.start_clock()
@@ -370,11 +429,10 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             run.stop_clock()
             check_weights(run, self.model.policy.parameters())
             content = freeze(self.model)
-            seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
             normalise = self.model.get_vec_normalize_env()
-            mean = play(run.env, policy_of(run.settings, self.model, normalise), seeds).mean()
+            mean = tested_return(run.env, policy_of(run.settings, self.model, normalise))
             run.trained = self.last = self.num_timesteps
-            run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
+            run.curve.append((run.trained, round(run.seconds, 3), mean))
             if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
                 best = {**content, "buffer": None, "trained": run.trained}
             run.save_checkpoint({**content, "best": best})
@@ -397,6 +455,20 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
     finish_training(run, best)
 
 
+def tested_return(env_id: str, policy: Any) -> float:
+    """Return a policy's mean return in the episodes of a test while training."""
+    returns = play(env_id, policy, range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES))
+    check_rewards(env_id, returns)
+    return float(returns.mean())
+
+
+def check_rewards(env_id: str, rewards: NDArray[Any]) -> None:
+    """Raise a UserError for a reward that is not a finite number; the learner would seem to diverge."""
+    wrong = rewards[~np.isfinite(rewards)]
+    if wrong.size:
+        raise UserError(f"the reward of {env_id} is {wrong[0]}; it must be a finite number in every state")
+
+
 def check_weights(run: Run, weights: Iterable[Any], error: Exception | None = None) -> None:
     """Raise a UserError, from what this led to, if a tensor of weights shows that a training diverged."""
     if not all((w.detach().abs() < LARGEST_WEIGHT).all() for w in weights):
@@ -414,12 +486,16 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
     module = import_module(OWN[run.algo][0])
     learner = module.Learner(run.env, module.Settings.of(run.hyperparameters), run.seed, run.steps)
     if content is not None:
-        learner.restore(content["learner"])
+        try:
+            learner.restore(content["learner"])
+        except Exception as error:  # another environment, or version of the learner, may lead to anything
+            raise UserError(
+                f"{run.path(CHECKPOINT)} cannot be resumed ({error}); --new starts over"
+            ) from error
     every = run.steps / TESTS
 
     def test() -> None:
-        seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-        mean = float(play(run.env, learner.policy, seeds).mean())
+        mean = tested_return(run.env, learner.policy)
         run.curve.append((run.trained, round(run.seconds, 3), mean))
         run.save_checkpoint({"learner": learner.state()})
         tested(run)
@@ -457,6 +533,7 @@ def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
     """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
+    check_rewards(run.env, returns)
     known, place = known_returns(run.env), machine()
     result = {
         **run.settings,

@@ -33,7 +33,7 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
-from agents.learners import LearnerSettings, trainable
+from agents.learners import Count, LearnerSettings, check_rewards, trainable
 from agents.run import CHECKPOINT, first_training_seed, reports_errors
 from agents.train import add_run_options, here, planned_runs, train_all
 from lag_envs.envs.stagger import stagger
@@ -55,8 +55,8 @@ class Settings(LearnerSettings):
     learner = NAME
 
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
-    n_envs: int = Field(ge=1, description="environments stepped together")
-    n_steps: int = Field(ge=1, description="steps of each environment between updates")
+    n_envs: Count = Field(description="environments stepped together")
+    n_steps: Count = Field(description="steps of each environment between updates")
     n_epochs: int = Field(ge=1, description="passes over these steps in an update")
     batch_size: int = Field(ge=2, description="steps of a minibatch")
     learning_rate: float = Field(ge=0, description="of Adam at the start; it falls linearly to 0")
@@ -71,7 +71,7 @@ class Settings(LearnerSettings):
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which that noise is held")
     log_std_init: float = Field(ge=-20, le=5, description="log standard deviation of actions at the start")
-    frames: int = Field(ge=1, description="observations that actor and critic see: an episode's last ones")
+    frames: Count = Field(description="observations that actor and critic see: an episode's last ones")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     critic: list[PositiveInt] = Field(min_length=1, description="widths of the critic's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
@@ -262,7 +262,7 @@ class Learner:
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
-        self.settings, self.steps, self.trained = settings, steps, 0
+        self.env_id, self.settings, self.steps, self.trained = env_id, settings, steps, 0
         self.rng = np.random.default_rng(seed)
         task = trainable(env_id)
         formulas = task.formulas
@@ -297,6 +297,7 @@ class Learner:
     def iterate(self) -> None:
         """Collect experience and learn from it."""
         rollout = self.collect()
+        check_rewards(self.env_id, rollout.rewards)
         self.update(rollout, *self.advantages(rollout))
         self.trained += rollout.rewards.size
 

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from agents import learners
 from agents.analysis import LEVELS, first_reached
-from agents.learners import LEARNERS, learner_label, suits, zoo_hyperparameters
+from agents.learners import LEARNERS, check_suits, learner_label, zoo_hyperparameters
 from agents.run import (
     Run,
     UserError,
@@ -31,12 +31,12 @@ from agents.run import (
     check_writable,
     known_name,
     reports_errors,
+    training_seeds,
 )
-from lag_envs import TASKS, store, workers
+from lag_envs import store, workers
 from lag_envs.evaluation.statistics import median_time
 from lag_envs.host import machine
 from lag_envs.options import module_parser, new_file, new_picture
-from lag_envs.own_files import is_file
 from lag_envs.scores import known_returns, score
 from lag_envs.tables import aligned
 
@@ -102,19 +102,14 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    if is_file(args.env) or ":" in args.env:
-        raise UserError(
-            f"a race is on ids of the package, which have a scale of scores, got {args.env}; agents.train "
-            "trains on tasks of your own"
-        )
-    task = TASKS[check_env(args.env)]()
+    check_env(args.env)
     if known_returns(args.env) is None:
         raise UserError(f"{args.env} has no scale of scores yet; python -m agents.scale measures one")
     names = [known_name("learner", name, LEARNERS) for name in dict.fromkeys(args.learners)]
-    if unfit := [name for name in names if not suits(name, task)]:
-        fit = ", ".join(name for name in LEARNERS if suits(name, task))
-        raise UserError(f"{unfit[0]} does not learn actions of {args.env}'s kind; available: {fit}")
+    for name in names:
+        check_suits(name, args.env)
     check_numbers(args, seeds=1, first_seed=0, steps=1)
+    seeds = training_seeds(args.first_seed, args.seeds)
     files = [file for file in (args.output, args.picture) if file]
     if len({file.resolve() for file in files}) < len(files):
         raise UserError(f"--output and --picture are both {args.picture}; give each its own file")
@@ -125,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows: list[dict[str, Any]] = []
     try:
         with live_view() as show:
-            for settings in trainings(args, names):
+            for settings in trainings(args, names, seeds):
                 row = next((row for row in before if settings.items() <= row.items()), None)
                 if row is None:
                     row = raced(settings, lambda now: show([*rows, now]))
@@ -147,9 +142,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if len(done) == len(rows) else 1
 
 
-def trainings(args: argparse.Namespace, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def trainings(args: argparse.Namespace, names: Sequence[str], seeds: range) -> Iterator[dict[str, Any]]:
     """Yield the settings of each training."""
-    for seed in range(args.first_seed, args.first_seed + args.seeds):
+    for seed in seeds:
         for name in names:
             hyper = zoo_hyperparameters(name, args.env)
             steps = args.steps or int(hyper["n_timesteps"])

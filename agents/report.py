@@ -321,6 +321,9 @@ def _method(data: Data) -> str:
             f"- Episodes: {data['episodes']:,} under each condition, unless a table says otherwise. Their"
             f" seeds start at {data['first_seed']:,}, are never used in training and tuning, and are the same"
             " for all agents. Agents act deterministically.",
+            "- *Settings*: those of fast PPO were chosen with training seeds 0 and 1, which are among"
+            " the reported ones, though by other episodes: this may flatter its scores a little."
+            " Searches by `python -m agents.tune` now train with other seeds.",
             *_fewer(data),
             "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their length in"
             " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if any, differ"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -19,9 +20,12 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from lag_envs import TASKS
+from lag_envs import TASKS, own_files
 from lag_envs.errors import UserError, hint, run_shown
+from lag_envs.scenes.base import Scene
 from lag_envs.store import write_file
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.registration import make_task
 
 SCHEMA = 1
 #: Seeds of the episodes on which agents are compared, and of those on which a policy is tested during
@@ -29,6 +33,8 @@ SCHEMA = 1
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
+#: There are so many seeds of trainings, see `first_training_seed`.
+SEEDS = 1000
 #: What a checkpoint begins with; the digest of the rest follows.
 DIGEST = b"sha256:"
 #: Types of the entries that are read from a result.
@@ -47,6 +53,16 @@ def fresh_seeds(episodes: int) -> range:
 def first_training_seed(seed: int) -> int:
     """Return the seed of a training's first environment: another training has other episodes throughout."""
     return 1_000_000 * seed % FIRST_FRESH_SEED
+
+
+def training_seeds(first: int, count: int) -> range:
+    """Return so many seeds of trainings, or raise a UserError if one would repeat another's episodes."""
+    if first + count > SEEDS:
+        raise UserError(
+            f"seeds of trainings must lie below {SEEDS}, for each to have episodes of its own; got up to "
+            f"{first + count - 1}"
+        )
+    return range(first, first + count)
 
 
 @dataclass
@@ -71,6 +87,8 @@ class Run:
     hyperparameters: dict[str, Any]
     #: The file or module of the user's own environment, as it was given; empty for one of the package.
     source: str = ""
+    #: The digest of the files that define it, see `source_digest`.
+    digest: str = ""
     trained: int = 0
     #: Times of training alone, without compiling, tests and evaluation: wall time and processor time.
     seconds: float = 0.0
@@ -82,7 +100,7 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """The settings that a checkpoint must have been made with."""
-        names = ("env", "algo", "seed", "steps", "hyperparameters")
+        names = ("env", "algo", "seed", "steps", "hyperparameters", *["digest"] * bool(self.source))
         return {"schema": SCHEMA} | {name: getattr(self, name) for name in names}
 
     @property
@@ -157,6 +175,11 @@ class Run:
         for name, value in self.settings.items():
             if found.get(name) != value:
                 what = f"{name} {found.get(name)!r}, not {value!r}"
+                if name == "digest":
+                    raise UserError(
+                        f"{file} belongs to another version of {self.source}; --new starts over, --output "
+                        "goes elsewhere"
+                    )
                 if name == "hyperparameters":
                     both = {**value, **(found.get(name) or {})}
                     other = [k for k in both if value.get(k) != (found.get(name) or {}).get(k)]
@@ -205,6 +228,11 @@ def read_result(file: Path) -> dict[str, Any]:
 
 def check_env(env_id: str) -> str:
     """Return the id of an environment of the package, or raise a UserError that suggests similar ids."""
+    if own_files.is_file(env_id) or ":" in env_id:
+        raise UserError(
+            f"this command is for ids of the package, got {env_id}; agents.train and agents.ppo train on "
+            "tasks of your own"
+        )
     return known_name("environment", env_id, TASKS)
 
 
@@ -218,12 +246,23 @@ def own_env(name: str) -> str:
     UserError
         If there is none, or several.
     """
-    from lag_envs import own_files
-
     if own_files.is_file(name):
         own_files.one(name)
         return own_files.registered(name)[0]
     return own_files.imported(name) if ":" in name else check_env(name)
+
+
+def source_digest(source: str, env_id: str) -> str:
+    """Return the digest of the files that define a user's task: the module that was given, and its classes'.
+
+    These are the classes of task and scene. What they call from other files is not noted.
+    """
+    task, modules = make_task(env_id), [source.partition(":")[0]]
+    for kind, base in ((type(task), Task), (type(task.scene), Scene)):
+        own = kind.__mro__[: kind.__mro__.index(base)]
+        modules += [each.__module__ for each in own if not each.__module__.startswith("lag_envs.")]
+    files = {getattr(sys.modules.get(name), "__file__", None): None for name in modules}
+    return sha256(b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
 
 
 def known_name(kind: str, name: str, known: Iterable[str]) -> str:

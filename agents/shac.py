@@ -3,10 +3,18 @@
 The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing has to be tried out. In
 each iteration the policy acts for a window of some steps (`Learner.collect`), the derivatives of all later
 rewards in the window with respect to each action are computed (`Learner.gradients`), and the policy follows
-the gradient (`Learner.update`). A critic estimates the rewards after the window. The algorithm is that of
-[1]_, with one addition: at each step, derivatives larger than `max_slope` are scaled back to it. Without a
-critic, and with windows as long as episodes, it is back-propagation through time, also called analytic policy
-gradients.
+the gradient (`Learner.update`). A critic estimates the rewards after the window. Without a critic, and with
+windows as long as episodes, it is back-propagation through time, also called analytic policy gradients.
+
+The algorithm follows [1]_, but differs in more than details:
+
+- At each step, derivatives larger than `max_slope` are scaled back to it.
+- The policy is deterministic, not a normal distribution: nothing is explored but what starts and kicks bring.
+- Actions beyond their limits are clipped, and moved back towards them, never further out.
+- Each action follows the gradient of the rewards after it, discounted from that action on. In [1]_ they are
+  discounted from the window's start, so that late actions in a window count less.
+- The critic's targets are its own values; [1]_ takes them from a copy that follows slowly.
+- A share of the episodes starts in random states (`random_starts`).
 
 For PyTorch a window is one batch. The derivatives of all its steps are computed at once, because the states
 are known by then; the backward pass is only a recursion of small matrices in NumPy.
@@ -29,7 +37,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
-from agents.learners import LearnerSettings, trainable
+from agents.learners import Count, LearnerSettings, check_rewards, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.torch import Step
@@ -47,8 +55,8 @@ class Settings(LearnerSettings):
     learner = NAME
 
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
-    n_envs: int = Field(ge=1, description="environments stepped together")
-    n_steps: int = Field(ge=1, description="steps of a window")
+    n_envs: Count = Field(description="environments stepped together")
+    n_steps: Count = Field(description="steps of a window")
     learning_rate: float = Field(ge=0, description="of the policy at the start; it falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
@@ -112,7 +120,7 @@ class Learner:
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
         torch.set_num_threads(1)  # the networks are too small for several threads
         torch.manual_seed(seed)
-        self.settings, self.steps, self.trained = settings, steps, 0
+        self.env_id, self.settings, self.steps, self.trained = env_id, settings, steps, 0
         self.rng = np.random.default_rng(seed)
         self.task = trainable(env_id)
         try:
@@ -147,6 +155,7 @@ class Learner:
     def iterate(self) -> None:
         """Collect a window and learn from it."""
         window = self.collect()
+        check_rewards(self.env_id, window.rewards)
         slopes = self.gradients(window)
         self.update(window, slopes)
         if self.settings.critic:

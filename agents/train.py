@@ -24,7 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from agents.learners import EPISODES, LEARNERS, TESTS, suits, train_rest, zoo_hyperparameters
+from agents.learners import EPISODES, LEARNERS, TESTS, check_trainable, suits, train_rest, zoo_hyperparameters
 from agents.run import (
     CHECKPOINT,
     MODEL,
@@ -36,13 +36,16 @@ from agents.run import (
     known_name,
     own_env,
     reports_errors,
+    source_digest,
+    training_seeds,
 )
 from lag_envs import TASKS, workers
-from lag_envs.options import module_parser
+from lag_envs.evaluation.statistics import mean_and_error
+from lag_envs.options import module_parser, new_folder
 from lag_envs.own_files import is_file
-from lag_envs.scores import score
+from lag_envs.scores import known_returns, normalised, score
 from lag_envs.store import write_file
-from lag_envs.tables import aligned
+from lag_envs.tables import aligned, mean_with_error
 from lag_envs.workers import check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
@@ -55,7 +58,8 @@ Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; finished
 A run resumes from its last checkpoint: for fast_ppo, shac and cloning with the same result as without the
 interruption, for the others with different episodes.
 Policies of SAC, TD3, TQC and DQN get better and worse while they learn: the one that did best in a test, on
-separate episodes, is kept. For PPO it is the last one.
+separate episodes, is kept. For PPO it is the last one. Tests and results are of the environment with its own
+parameters; a TimeLimit among the hyperparameters shortens the episodes of training alone.
 
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
@@ -109,7 +113,7 @@ def add_run_options(p: argparse.ArgumentParser) -> None:
         "--steps", type=int,
         help="environment steps per seed, in place of n_timesteps; rounded up to whole updates",
     )  # fmt: skip
-    p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default %(default)s")
+    p.add_argument("--output", type=new_folder, default="runs", metavar="FOLDER", help="default %(default)s")
     p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
 
 
@@ -118,9 +122,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where a seed failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
     runs = planned_runs(args)
-    for run in runs:
-        if run.load_result() is not None:
-            print(f"{run.name}: finished before")
     parallel_map = (
         partial(on_ray, address=args.ray) if args.ray else partial(train_in_processes, jobs=args.jobs)
     )
@@ -132,6 +133,9 @@ def train_all(
 ) -> int:
     """Train the runs that are not finished, print all returns, and return the command's exit status."""
     todo = [run for run in runs if run.load_result() is None]
+    for run in runs:
+        if run not in todo:
+            print(f"{run.name}: finished before")
     failed, stopped = show_progress(todo, parallel_map) if todo else ({}, False)
     print_returns([run for run in runs if run.name not in failed])
     return report_failures(failed, stopped, module, arguments)
@@ -147,22 +151,22 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
         raise UserError("--ray takes ids and module:ID; a file is not on the other machines")
     algos = [known_name("algorithm", name, LEARNERS) for name in dict.fromkeys(args.algo)]
     check_numbers(args, seeds=1, first_seed=0, steps=1, jobs=1)
-    if args.output.exists() and not args.output.is_dir():
-        raise UserError(f"--output must be a folder, {args.output} is not")
+    digests = {env: source and source_digest(source, env) for env, source in sources.items()}
     runs = []
     for (env, source), algo in product(sources.items(), algos):
         if args.env == ["all"] and not suits(algo, TASKS[env]()):
             continue
+        check_trainable(algo, env)
         hyper = {**zoo_hyperparameters(algo, env, args.config), **changed}
         try:
             steps = args.steps or int(float(hyper["n_timesteps"]))
-        except (KeyError, ValueError, TypeError):
+        except (KeyError, ValueError, TypeError, OverflowError):
             steps = 0
         if steps < 1:
             raise UserError(f"n_timesteps must be a number of steps, got {hyper.get('n_timesteps')!r}")
-        for seed in range(args.first_seed, args.first_seed + args.seeds):
+        for seed in training_seeds(args.first_seed, args.seeds):
             folder = args.output / env / algo / f"seed{seed}"
-            runs.append(Run(folder, env, algo, seed, steps, hyper, source))
+            runs.append(Run(folder, env, algo, seed, steps, hyper, source, digests[env]))
     if args.ray:  # before anything is removed
         check_address(args.ray)
     for run in runs:
@@ -342,7 +346,9 @@ def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str
                 elif kind == "tested":
                     run.curve = what
                     trained, seconds, mean = what[-1]
-                    about = f"{trained:>9,} steps, {seconds:5.1f} s, return {mean:.2f}{_score(run, mean)}"
+                    value = score(run.env, mean)
+                    tail = "" if value is None else f", score {value:.2f}"
+                    about = f"{trained:>9,} steps, {seconds:5.1f} s, return {mean:.2f}{tail}"
                     _say(bar, f"{run.name}: {about}")
                 else:
                     del left[name]
@@ -352,16 +358,19 @@ def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str
                     run.path(CHECKPOINT).unlink(missing_ok=True)
                     steps[name] = run.steps
                     result = run.load_result() or {}
-                    mean = result["mean_return"]
-                    _say(bar, f"{run.name}: finished, return {mean:.2f}{_score(run, mean)}")
+                    mean, value = with_errors(run.env, result["evaluation"]["returns"])
+                    _say(bar, f"{run.name}: finished, return {mean}" + f", score {value}" * bool(value))
     except KeyboardInterrupt:
         return failed, True
     return failed, False
 
 
-def _score(run: Run, mean: float) -> str:
-    value = score(run.env, mean)
-    return "" if value is None else f", score {value:.3f}"
+def with_errors(env_id: str, returns: Sequence[float]) -> tuple[str, str]:
+    """Return the mean return and its score, with standard errors over episodes; no score without a scale."""
+    known, mean = known_returns(env_id), mean_with_error(*mean_and_error(returns), exact=2)
+    if known is None:
+        return mean, ""
+    return mean, mean_with_error(*mean_and_error(normalised(known, returns)), exact=3)
 
 
 def _say(bar: Any, line: str) -> None:
@@ -376,12 +385,12 @@ def print_returns(runs: Sequence[Run]) -> None:
         results = [(run, result) for run in some if (result := run.load_result()) is not None]
         if not results:
             continue
-        print(f"\n{env}, {algo}, {EPISODES} fresh episodes each")
+        print(f"\n{env}, {algo}, {EPISODES} fresh episodes each: mean ± standard error over episodes")
         rows = [("seed", "steps", "seconds", "return", "score")]
         for run, result in results:
-            tail = "" if result["score"] is None else f"{result['score']:.3f}"
-            trained, seconds, mean = result["trained"], result["wall_seconds"], result["mean_return"]
-            rows.append((str(run.seed), f"{trained:,}", f"{seconds:.1f}", f"{mean:.2f}", tail))
+            trained, seconds = result["trained"], result["wall_seconds"]
+            both = with_errors(env, result["evaluation"]["returns"])
+            rows.append((str(run.seed), f"{trained:,}", f"{seconds:.1f}", *both))
         print("\n".join(aligned(rows)))
         print(f"Written to {results[0][0].folder.parent}/")
 

@@ -1,4 +1,7 @@
-"""Tune numbers of controllers and settings of our PPO, on seeds that no evaluation uses.
+"""Tune numbers of controllers and settings of our PPO, in episodes that no evaluation uses.
+
+Trainings have seeds that no reported result has. Files without a ``first_seed`` are of earlier searches, with
+training seeds from 0 on: these are reported too, so that their choice may flatter the reported scores.
 
 ``python -m agents.tune --help`` has the options.
 """
@@ -20,7 +23,15 @@ from scipy.optimize import differential_evolution
 from agents import learners
 from agents.learners import load_policy, zoo_hyperparameters
 from agents.results import ROOT
-from agents.run import Run, UserError, check_env, check_numbers, check_writable, reports_errors
+from agents.run import (
+    Run,
+    UserError,
+    check_env,
+    check_numbers,
+    check_writable,
+    reports_errors,
+    training_seeds,
+)
 from lag_envs import workers
 from lag_envs.controllers import build
 from lag_envs.errors import hint
@@ -35,6 +46,8 @@ from lag_envs.tasks import TASKS
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
 FIRST_TUNING_SEED = 3_000_000_000
+#: The first seed of the trainings; reported results have lower ones.
+FIRST_TRAINING_SEED = 500
 LEARNER = "fast_ppo"
 #: Values tried for each setting. In a random draw, a setting keeps its value with probability 1/2.
 CHOICES: Mapping[str, Sequence[Any]] = {
@@ -62,8 +75,9 @@ EPILOG = f"""By default the numbers of the environment's controllers are tuned b
 and printed; the controllers' defaults were found in this way.
 
 With --settings, settings of {LEARNER} are tried: first the task's own, then others drawn at random,
-each with some training seeds. FILE stores every training, so that the command can be interrupted and run
-again, also with more --settings or --seeds. Copy the best settings by hand into the task's `hyperparameters`.
+each with some training seeds, from {FIRST_TRAINING_SEED} on: no reported result has these. FILE stores every
+training, so that the command can be interrupted and run again, also with more --settings or --seeds. Copy
+the best settings by hand into the task's `hyperparameters`.
 
 examples:
   python -m agents.tune PivotedBar-v0 --only "energy shaping + LQR"
@@ -128,7 +142,9 @@ def search_settings(
     own = zoo_hyperparameters(LEARNER, env_id)
     about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
     about["changed_from"] = own
-    data = read(file, about) or about | {"machine": machine(), "settings": []}
+    new = about | {"machine": machine(), "first_seed": FIRST_TRAINING_SEED, "settings": []}
+    data = read(file, about) or new
+    first = data.get("first_seed", 0)  # earlier searches have none
     for number in range(len(data["settings"]), count):
         changed = {name: value for name, value in drawn_changes(number).items() if own[name] != value}
         data["settings"].append({"number": number, "changed": changed, "runs": []})
@@ -139,7 +155,7 @@ def search_settings(
         for setting in data["settings"][:count]:
             number, changed = setting["number"], setting["changed"]
             done = {run["seed"] for run in setting["runs"]}
-            for seed in sorted(set(range(seeds)) - done):
+            for seed in sorted(set(range(first, first + seeds)) - done):
                 place = Path(folder, f"{number}-{seed}")
                 futures[submit(trial, place, env_id, changed, seed, steps, episodes)] = setting, seed
         for (setting, seed), found in workers.as_they_finish(futures):
@@ -202,7 +218,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     p = module_parser(
         "agents.tune",
-        "Tune numbers of controllers or settings of a learner, on seeds that no evaluation uses.",
+        "Tune numbers of controllers or settings of a learner, in episodes that no evaluation uses.",
         EPILOG,
     )
     p.add_argument("env", metavar="ENV", help="id of an environment")
@@ -223,6 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     known = tunable(check_env(args.env))
     check_numbers(args, episodes=1, generations=1, settings=1, steps=1, seeds=1, jobs=1)
+    training_seeds(FIRST_TRAINING_SEED, args.seeds or 2)
     other = ("only", "generations") if args.settings else ("steps", "seeds", "jobs", "output")
     if given := [name for name in other if getattr(args, name) is not None]:
         raise UserError(f"--{given[0]} has no effect {'with' if args.settings else 'without'} --settings")

@@ -12,7 +12,7 @@ from gymnasium.wrappers.vector import ClipAction, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from agents import bench, demo, ppo, race, report, scale, tune
+from agents import bench, demo, ppo, race, report, scale, train, tune
 from lag_envs.controllers import make_controller
 from lag_envs.errors import UserError
 from lag_envs.evaluation.rollout import play
@@ -256,6 +256,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path, monkeypatch):
         (["--algo", "fastppo"], "did you mean fast_ppo"),
         (["--steps", "0"], "--steps must lie between 1"),
         (["--seed", "-1"], "--seed must lie between"),
+        (["--seed", "1000"], "seeds of trainings must lie below 1000"),
     ],
 )
 def test_demo_says_what_is_wrong(arguments, message, demonstrate):
@@ -336,6 +337,19 @@ def test_a_file_that_cannot_be_written_is_named_before_the_work(command, argumen
     if command is scale:
         assert scale.main([ENV, "--output", str(taken)]) == 2
         assert "taken cannot be read" in capsys.readouterr().err and taken.read_text() == "{"
+
+
+@pytest.mark.parametrize("command", [ppo, train, demo])
+def test_a_folder_that_cannot_be_written_is_named_before_the_work(command, tmp_path, capsys):
+    taken = tmp_path / "taken"
+    taken.write_text("{")
+    for folder, message in {
+        taken: "is not a folder",
+        taken / "x" / "y": "taken is not a writable folder",
+    }.items():
+        with pytest.raises(SystemExit) as left:
+            command.main([*([] if command is demo else [ENV]), "--output", str(folder)])
+        assert left.value.code == 2 and message in capsys.readouterr().err
 
 
 @pytest.mark.slow

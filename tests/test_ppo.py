@@ -155,6 +155,13 @@ def test_a_seed_decides_everything_with_interruptions_or_without(algo, more, tmp
     assert play(ENV, load_policy(whole.folder), fresh_seeds(20)).tolist() == learnt(whole)[1]
 
 
+def test_a_checkpoint_that_does_not_fit_is_told_in_a_line(tmp_path):
+    other = make_learner(pivoted_bar.SwingUp.id)
+    make_run(tmp_path).save_checkpoint({"learner": other.state()})
+    with pytest.raises(UserError, match=r"cannot be resumed \(.*\); --new starts over"):
+        go(make_run(tmp_path))
+
+
 @pytest.mark.parametrize("frames", [1, 3])
 def test_the_policy_that_was_written_is_the_one_that_was_evaluated(frames, tmp_path):
     run = make_run(tmp_path, frames=frames)
@@ -260,6 +267,19 @@ def test_rollouts_are_what_happened():
     assert len({tuple(np.flatnonzero(row)) for row in found.over}) > 2  # staggered
 
 
+def test_a_reward_that_is_no_number_is_named(monkeypatch):
+    learner = make_learner()
+    step = learner.envs.step
+
+    def undefined(actions):
+        observation, reward, *rest = step(actions)
+        return observation, np.where(np.arange(8) == 3, np.nan, reward), *rest
+
+    monkeypatch.setattr(learner.envs, "step", undefined)
+    with pytest.raises(UserError, match=f"the reward of {ENV} is nan; it must be a finite number"):
+        learner.iterate()
+
+
 def test_frames_are_the_last_observations_of_an_episode(monkeypatch):
     learner, stepped = make_learner(episode_share=0.02, frames=3), []
     wide, step = learner.observation.shape[1] // 3, learner.envs.step
@@ -342,7 +362,9 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
     assert "256 steps" in output and ", score " in output and "with imports, compiling" in output
     result = json.loads((tmp_path / ENV / ppo.NAME / "seed1" / RESULT).read_text())
     assert result["hyperparameters"]["gamma"] == 0.9 and result["trained"] == 256
-    assert ppo.main(given) == 0 and " steps, " not in capsys.readouterr().out  # finished before
+    assert ppo.main(given) == 0
+    output = capsys.readouterr().out
+    assert " steps, " not in output and output.count("finished before\n") == 2
     assert ppo.main([ENV, "--output", str(tmp_path), "--steps", "256"]) == 2
     assert "other hyperparameters (" in capsys.readouterr().err
 
@@ -353,6 +375,10 @@ def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, ca
         (["PivotedBra-v0"], "did you mean PivotedBar-v0"),
         ([ENV, "--gamma", "1.5"], "gamma: Input should be less than or equal to 1, got 1.5"),
         ([ENV, "--frames", "0"], "frames: Input should be greater than or equal to 1, got 0"),
+        (
+            [ENV, "--n-envs", "100000000"],
+            "n_envs: Input should be less than or equal to 100000, got 100000000",
+        ),
         ([ENV, "--actor", "0"], "actor.0: Input should be greater than 0, got 0"),
         ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = 6144, got 1000\n"),
     ],
@@ -440,9 +466,9 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     given[2], given[4] = "3", "2"
     assert tune.main(given) == 0
     output = capsys.readouterr().out
-    assert output.count("setting 0, seed 0: ") == 1 and output.count("setting 0, seed 1: ") == 1
+    assert output.count("setting 0, seed 500: ") == 1 and output.count("setting 0, seed 501: ") == 1
     second = json.loads(file.read_text())["settings"]
-    assert [[r["seed"] for r in s["runs"]] for s in second] == [[0, 1]] * 3
+    assert [[r["seed"] for r in s["runs"]] for s in second] == [[500, 501]] * 3
     assert [s["runs"][0] for s in second[:2]] == [s["runs"][0] for s in first]
     best = max(second, key=lambda s: sum(r["return"] for r in s["runs"]))
     assert output.splitlines()[-5].split()[0] == str(best["number"])  # the row below the head

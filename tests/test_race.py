@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from test_ppo import here
 
-from agents import race, run
+from agents import race, run, tune
 from agents.run import UserError
 from lag_envs.tasks import cart_pole, incline
 
@@ -135,6 +135,10 @@ def test_a_disk_without_room_is_named_before_the_work(tmp_path):
         (["--steps", "99999999999999999999"], "--steps must lie between 1 and 2147483647, got 999"),
         (["--seeds", "0"], "--seeds must lie between 1"),
         (
+            ["--seeds", "2", "--first-seed", "999"],
+            "must lie below 1000, for each to have episodes of its own",
+        ),
+        (
             ["--learners", "fast_ppo", "dqn"],
             f"dqn does not learn actions of {ENV}'s kind; available: ppo, sac",
         ),
@@ -149,9 +153,11 @@ def test_mistakes_are_named_before_the_work(arguments, message, command, monkeyp
     assert status == 2 and message in output and output.count("\n") == 1
 
 
-def test_a_file_of_ones_own_has_no_scale(capsys):
-    assert race.main(["mine.py"]) == 2
-    assert "which have a scale of scores, got mine.py; agents.train trains" in capsys.readouterr().err
+@pytest.mark.parametrize("name", ["mine.py", "mine.py:Two", "mine:Two-v0"])
+@pytest.mark.parametrize("module", [race, tune])
+def test_a_task_of_ones_own_is_for_other_commands(module, name, capsys):
+    assert module.main([name]) == 2
+    assert f"is for ids of the package, got {name}; agents.train and agents.ppo" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["shac", "cloning", "sac"])

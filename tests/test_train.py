@@ -23,11 +23,14 @@ from trainings import go, kill_and_interrupt, short_evaluations
 from agents import learners, run, train
 from agents.learners import ALGORITHMS, load_policy, zoo_hyperparameters
 from agents.run import Run, UserError
-from lag_envs import cli
+from lag_envs import cli, own_files, sb3
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import OFF_POLICY, as_yaml
 from lag_envs.leaderboard.networks import bin_centres
+from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS, incline
+from lag_envs.tasks.arm import Reach
+from lag_envs.tasks.cart_pole import CartPoleExact
 
 ROOT = Path(__file__).parents[1]
 ENV = incline.Tilt.id
@@ -206,10 +209,34 @@ def test_learners_refuse_what_they_do_not_know(tmp_path):
         (f"{ENV}: {{gamma: high}}", f"entry {ENV}: gamma: Input should be a valid number, got 'high'"),
         (f"{ENV}: {{n_envs: 2.5}}", "n_envs: Input should be a valid integer, got 2.5"),
         (f"{ENV}: {{policy: 1}}", "policy: Input should be a valid string, got 1"),
+        (f"{ENV}: {{n_envs: 0}}", "n_envs: Input should be greater than or equal to 1, got 0"),
+        (
+            f"{ENV}: {{n_envs: 1000000000}}",
+            "n_envs: Input should be less than or equal to 100000, got 1000000000",
+        ),
+        (f"{ENV}: {{frame_stack: -1}}", "frame_stack: Input should be greater than or equal to 1, got -1"),
+        (f"{ENV}: {{normalize: {{foo: 1}}}}", "normalize has no hyperparameter 'foo'; available: training"),
+        (f"{ENV}: {{normalize: {{clip_obs: x}}}}", "clip_obs: Input should be a valid number, got 'x'"),
+        (f"{ENV}: {{normalize: {{gamma: 0.9}}}}", "normalize has no hyperparameter 'gamma'"),
+        (f"{ENV}: {{normalize: yes please}}", "normalize: Input should be a valid boolean, got 'yes please'"),
+        (
+            f"{ENV}: {{env_kwargs: {{mass: 1}}}}",
+            "env_kwargs would change the environment of training, but not",
+        ),
+        (f"{ENV}: {{env_wrapper: a.B}}", "env_wrapper: Input should be a valid list, got 'a.B'"),
+        (
+            f"{ENV}: {{env_wrapper: [{{{learners.TIME_LIMIT}: {{max_episode_steps: abc}}}}]}}",
+            "TimeLimit: max_episode_steps: Input should be a valid integer, got 'abc'",
+        ),
+        (
+            f"{ENV}: {{vec_env_wrapper: [{{{learners.SCALE}: {{factor: abc}}}}]}}",
+            "ScaledReward: factor: Input should be a valid number, got 'abc'",
+        ),
     ):
         file.write_text(text)
         with pytest.raises(UserError, match=re.escape(message)):
             zoo_hyperparameters("ppo", ENV, file)
+    file.write_text(f"{ENV}: {{policy: 1}}")
     with pytest.raises(UserError, match=r"bad.yml, entry .*: settings of fast_ppo: policy is an unknown key"):
         zoo_hyperparameters("fast_ppo", ENV, file)
 
@@ -222,6 +249,28 @@ def test_a_training_that_diverges_is_told_in_a_line(algo, tmp_path):
     assert re.fullmatch(
         r"the training diverged \(seed 3, after [0-9]+ steps\): lower learning_rate", failure.reason
     )
+
+
+@pytest.mark.parametrize(("algo", "returns"), [("ppo", -np.inf), ("fast_ppo", np.nan)])
+def test_a_reward_that_is_no_number_is_not_called_divergence(algo, returns, tmp_path, monkeypatch):
+    monkeypatch.setattr(learners, "play", lambda env, policy, seeds: np.full(len(seeds), returns))
+    hyper = zoo_hyperparameters(algo, ENV) | SHORT["ppo"]
+    with pytest.raises(UserError, match=f"the reward of {ENV} is {returns}; it must be a finite number"):
+        go(Run(tmp_path, ENV, algo, 3, 400, hyper))
+
+
+@pytest.mark.parametrize("algo", ["ppo", "td3"])
+def test_nor_is_one_that_only_exploration_meets(algo, tmp_path, monkeypatch):
+    step = sb3.VecEnv.step_wait
+
+    def undefined(self):
+        observations, rewards, *rest = step(self)
+        rewards[1] = np.nan
+        return observations, rewards, *rest
+
+    monkeypatch.setattr(sb3.VecEnv, "step_wait", undefined)
+    with pytest.raises(UserError, match=f"the reward of {ENV} is nan"):
+        go(make_run(tmp_path, algo, normalize=True))
 
 
 # --- damaged and foreign files ---
@@ -398,12 +447,25 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--algo", "sacc"], "did you mean sac"),
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
+        ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, for each to have episodes"),
+        ([ENV, "--seeds", "1001"], "episodes of its own; got up to 1000"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
+        ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac does not learn actions of CartPoleExact-v0's kind"),
+        (
+            [Reach.id, "--algo", "dqn"],
+            f"dqn does not learn actions of {Reach.id}'s kind; available: ppo, sac",
+        ),
     ],
 )
 def test_mistakes_are_named(arguments, message, command):
     status, output = command(*arguments)
     assert status == 2 and message in output and output.startswith("python -m agents.train: error:")
+
+
+def test_steps_without_an_end_are_refused(command, config):
+    config.write_text(f"{ENV}: {{n_timesteps: .inf, policy: MlpPolicy}}")
+    status, output = command(ENV, "--config", str(config))
+    assert status == 2 and "n_timesteps must be a number of steps, got inf" in output
 
 
 @pytest.mark.parametrize(
@@ -447,6 +509,14 @@ def test_only_what_may_succeed_later_is_resumed(capsys):
         assert ("a failed: no such luck" in output.err) == ("a" in failed)
         resumed = re.search(f"To resume: .* -m agents.train {ENV}\n", output.out)
         assert bool(resumed) == (stopped or "b" in failed)
+
+
+def test_digits_are_as_many_as_the_standard_error_allows():
+    known = known_returns(ENV)
+    returns = known.random + (known.best - known.random) * np.array([0.8, 1.0, 1.0, 0.8])
+    mean, value = train.with_errors(ENV, returns)
+    assert value == "0.900 ± 0.058" and re.fullmatch(r"\d+\.\d ± \d+\.\d|\d+ ± \d\d", mean)
+    assert train.with_errors("OwnDrift-v0", [1.0, 1.0]) == ("1.00 ± 0.00", "")
 
 
 def test_a_missing_ray_is_named(command, config):
@@ -570,13 +640,78 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
-        slow(
-            [f"{SEVERAL}:Switched", "--algo", "sac"],
-            "sac does not take the hyperparameters of OwnSwitched-v0",
-        ),
-        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn needs a single control with discrete actions"),
+        slow([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not learn actions of OwnSwitched-v0's kind"),
+        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn does not learn actions of OwnCrane-v0's kind"),
+        slow([f"{SEVERAL}:Drift"], "OwnDrift-v0 has no control: there is nothing to learn"),
     ],
 )
 def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):
     status = train.main([*arguments, "--steps", "100", "--output", str(tmp_path)])
-    assert status in (1, 2) and message in "".join(capsys.readouterr())
+    assert status == 2 and message in "".join(capsys.readouterr())
+
+
+SLED = """
+from sled import Sled
+
+import lag_envs
+from lag_envs.tasks import Task
+
+
+class Slide(Task):
+    id = "OwnSlide-v0"
+    scene = Sled
+    interval, steps = 0.1, 30
+    action = {"push": 1.0}
+    start = {"x": 0.5}
+
+    def observe(self, after, target, xp):
+        return {"x": after.x, "x_dot": after.x_dot}
+
+    def reward(self, before, after, control, target, dt, xp):
+        return -after.x**2
+
+
+lag_envs.register(Slide)
+"""
+SCENE = """
+from lag_envs.scenes import Scene
+
+
+class Sled(Scene):
+    coordinates = {"x": "m"}
+    controls = {"push": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2
+
+    def potential(self, q, xp):
+        return 0.0
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.push}
+"""
+
+
+@pytest.mark.parametrize("edited", ["slide.py", "sled.py"])
+@pytest.mark.parametrize("given", ["slide.py", "slide.py:Slide", "slide:OwnSlide-v0"])
+def test_a_task_that_was_edited_is_another_one(given, edited, tmp_path, monkeypatch):
+    (tmp_path / "slide.py").write_text(SLED)
+    (tmp_path / "sled.py").write_text(SCENE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    args = train.parser().parse_args([given, "--algo", "fast_ppo"])
+    try:
+        (begun,) = train.planned_runs(args)
+        begun.save_checkpoint({})
+        assert train.planned_runs(args)[0].settings == begun.settings
+        (tmp_path / edited).write_text((tmp_path / edited).read_text() + "\n")
+        with pytest.raises(UserError, match=f"pkl belongs to another version of {given}; --new starts over"):
+            train.planned_runs(args)
+        args.new = True
+        assert train.planned_runs(args)[0].digest != begun.digest
+    finally:
+        own_files.load_module.cache_clear()
+        gym.registry.pop("OwnSlide-v0", None)
+        for name in ("slide", "sled", "own_slide"):
+            sys.modules.pop(name, None)
+    assert "digest" not in make_run(tmp_path).settings  # a task of the package is known by its id

@@ -15,7 +15,7 @@ WORKED = {"trained": 256, "return": -2.0, "score": 0.9, "seconds": 1.0, "process
 
 
 def second_fails(folder, env_id, changed, seed, steps, episodes):
-    if seed == 1:
+    if seed == 501:
         raise OSError(28, "No space left on device")
     return {"seed": seed} | WORKED
 
@@ -44,16 +44,27 @@ def search(monkeypatch, capsys, tmp_path):
 
 def test_trainings_that_fail_are_said_and_tried_again(search, tmp_path, monkeypatch):
     status, output, kept = search()
-    assert status == 1 and kept == [0]
-    assert "setting 0, seed 1: failed: OSError: [Errno 28] No space left on device\n" in output
+    assert status == 1 and kept == [500]
+    assert "setting 0, seed 501: failed: OSError: [Errno 28] No space left on device\n" in output
     assert "1 of the trainings failed; re-run the command to try them again" in output and "-2.00" in output
     # Earlier versions stored the failures.
     data = json.loads((tmp_path / "tuning.json").read_text())
-    data["settings"][0]["runs"].append({"seed": 1, "failed": "OSError"})
+    data["settings"][0]["runs"].append({"seed": 501, "failed": "OSError"})
     (tmp_path / "tuning.json").write_text(json.dumps(data))
     monkeypatch.setattr(tune, "trial", lambda folder, *given: {"seed": given[2]} | WORKED)
     status, output, kept = search()
-    assert status == 0 and kept == [0, 1] and "seed 0" not in output
+    assert status == 0 and kept == [500, 501] and "seed 500" not in output
+
+
+def test_a_search_goes_on_with_the_seeds_that_it_began_with(search, tmp_path, monkeypatch):
+    """Earlier versions began with 0."""
+    monkeypatch.setattr(tune, "trial", lambda folder, *given: {"seed": given[2]} | WORKED)
+    assert search("--seeds", "1")[2] == [500]
+    data = json.loads((tmp_path / "tuning.json").read_text())
+    assert data.pop("first_seed") == 500
+    data["settings"][0]["runs"][0]["seed"] = 0
+    (tmp_path / "tuning.json").write_text(json.dumps(data))
+    assert search()[2] == [0, 1]
 
 
 @pytest.mark.slow
@@ -64,7 +75,7 @@ def test_a_search_in_which_nothing_worked_has_no_table(monkeypatch, tmp_path, ca
     file = tmp_path / "tuning.json"
     assert tune.main([ENV, "--settings", "1", "--seeds", "1", "--output", str(file)]) == 1
     output = "".join(capsys.readouterr())
-    assert "seed 0: failed: the process died, exit status -9" in output
+    assert "seed 500: failed: the process died, exit status -9" in output
     assert "nan" not in output and "mean return" not in output and not file.exists()
     assert (tmp_path / "told").read_text() and not os.path.exists((tmp_path / "told").read_text())
 

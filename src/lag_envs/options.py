@@ -38,8 +38,6 @@ def new_file(text: str) -> Path:
     argparse.ArgumentTypeError
         If no such file can be written. Missing folders are made when the file is written.
     """
-    import tempfile
-
     path = Path(text)
     if path.is_dir():
         raise argparse.ArgumentTypeError(f"{text} is a folder")
@@ -47,19 +45,41 @@ def new_file(text: str) -> Path:
         if not os.access(path, os.W_OK):
             raise argparse.ArgumentTypeError(f"{text} cannot be written to")
         return path
-    folder = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
-    try:
-        # Permissions do not tell all: nobody makes a file in /proc.
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise argparse.ArgumentTypeError(
-            f"{text} cannot be written: {folder} is not a writable folder"
-        ) from error
+    _check_folder(text, Path(os.path.realpath(path)).parent)
     with contextlib.suppress(OSError):  # no such file yet, or no output
         if os.path.samestat(path.stat(), os.fstat(1)):
             raise argparse.ArgumentTypeError(f"{text} is the file that this command prints to; name another")
     return path
+
+
+def new_folder(text: str) -> Path:
+    """Return the folder of an option, before hours of work are spent on what could not be written to it.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If it is none, or nothing can be written to it. Missing folders are made when files are written.
+    """
+    path = Path(text)
+    if path.exists() and not path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text} is not a folder")
+    _check_folder(text, Path(os.path.realpath(path)))
+    return path
+
+
+def _check_folder(text: str, folder: Path) -> None:
+    """Raise an error for an argument if nothing can be written into a folder, or the next one that exists."""
+    import tempfile
+
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    try:
+        # Permissions do not tell all: nobody makes a file in /proc.
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text} cannot be written: {there} is not a writable folder"
+        ) from error
 
 
 def new_picture(text: str) -> Path:
