@@ -453,7 +453,7 @@ def swing(reward):
 @pytest.mark.parametrize(
     ("reward", "message"),
     [
-        (lambda self, before, after, control, target, dt, xp: -control[0] * after.x, "apart from each other"),
+        (lambda self, before, after, control, target, dt, xp: -control[0] * after.x, "separate terms"),
         (lambda self, before, after, control, target, dt, xp: -((after.x - before.x) ** 2), "after the step"),
         (lambda self, before, after, control, target, dt, xp: -xp.abs(after.x), "needs a smooth reward"),
         (lambda self, before, after, control, target, dt, xp: xp.where(after.x > 1.0, 0.0, 1.0), "smooth"),

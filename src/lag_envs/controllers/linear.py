@@ -63,8 +63,8 @@ def quadratic_cost(task: Task, state: Sequence[float] | Array) -> Array:
         ) from error
     if reward.free_symbols & set(before) or found[:-1, -1].any():
         raise ValueError(
-            f"the regulator needs a reward of the state after the step and of the control, apart from each "
-            f"other; that of {type(task).__name__} is not (Regulator takes weights instead)"
+            "the regulator needs a reward with separate terms of the state after the step and of the "
+            f"control; that of {type(task).__name__} is not (Regulator takes weights instead)"
         )
     return found
 
