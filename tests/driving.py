@@ -152,15 +152,17 @@ def shows(page, name, wanted):
 
 @pytest.fixture(name="drive")
 def driver_page(browsing, bare):
-    """Open an environment's page, and its driver."""
+    """Open an environment's page, and its driver; `slowly` lets no episode end before a slow machine has acted."""
 
-    def open_it(id=pivoted_bar.Balance.id, hash="", folder=bare, **options):
+    def open_it(id=pivoted_bar.Balance.id, hash="", folder=bare, slowly=False, **options):
         page = browsing.open(f"{folder.as_uri()}/{id}.html{hash}", folder.as_uri(), **options)
         if not hash:
             page.click(".begin")
         until(
             page, "document.querySelector('.driver .stage') && document.querySelector('.message').textContent"
         )
+        if slowly:
+            page.select_option(".drive-controls select >> nth=0", "0.1")
         return page
 
     return open_it
