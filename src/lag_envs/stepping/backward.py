@@ -1,11 +1,16 @@
 """The step of `lag_envs.stepping.series` backwards: from the gradient at its end to that at its start.
 
-The series that ends a control step is still available; those of earlier substeps are expanded again. Then the
-recurrences are traversed from the highest order to the lowest. Each is a relation that is linear in the
-coefficient that it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The
-cotangent P_k of its Σ_j A_j B_{k-j} is kept. The cotangents of its factors are then sums of products too:
-that of A_j is Σ_{k>j} P_k B_{k-j}. So an order costs two sums where the series has one. The lengths of the
-substeps are held fixed.
+A small change of the motion obeys M δa = δF - δM a. So the cotangents μ of places and ν of velocities, with
+M σ = ν and g = σᵀ(F - M a), obey the adjoint equation::
+
+    dμ/dt = -∂g/∂q,     dν/dt = -μ - ∂g/∂v
+
+whose derivatives are taken with σ and a held fixed. It starts at the end of a substep and goes back in time,
+so both series are expanded there: that of the motion first, then that of the cotangents, order by order. The
+derivatives of g follow node by node from the last to the first. A product z = x y adds the series z̄ y to x̄
+and z̄ x to ȳ; a function with z' = w x' adds z̄ w. So an order costs at most two sums of products where the
+series of the motion has one. The gradient with respect to a weight w is the integral of ∂g/∂w. All these
+series show by their own terms what they leave out. The lengths of the substeps are held fixed.
 """
 
 from __future__ import annotations
@@ -14,10 +19,9 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
+from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, KNOWN, Node, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
-from lag_envs.stepping.paired import Pair, PairTarget
-from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, following
+from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, alike, following
 from lag_envs.stepping.target import Target
 
 
@@ -33,50 +37,80 @@ class Backward(Series):
     """
 
     def __init__(self, record: SeriesRecord, sources: tuple[str, ...]) -> None:
-        super().__init__(record)
         self._sources = sources
         #: Weights that sources change.
         self._active = [
             name for name, slopes in record.tangents.items() if any(source in sources for source in slopes)
         ]
+        super().__init__(record)
         del self.slots  # more series are needed than for the step
-        for i in range(self.size):
-            self._slot("a", i)
-        for n in self.live:
-            node = record.nodes[n]
-            if node.op == "sum":
-                for a, w in zip(node.args, node.weights, strict=False):
-                    if w in self._active:
-                        self.factor_of(a)
-        self.slots = len(self.slot_of)
-        #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to
-        #: which several orders add, or which are known, and so wanted at the end.
-        self._sums = {key: self.slots + i for i, key in enumerate(self.pairs)}
-        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self.pairs.values() if a.back}
-        kept = [
-            slot
-            for (kind, i), slot in self.slot_of.items()
-            if kind == "v" or slot in rates or self._is_known(kind, i)
+        #: Products of a cotangent's series (its slot) with one of the motion, by what needs them.
+        self.products: dict[tuple, tuple[int, Factor]] = {}
+        for n in self._reached:
+            self._plan_back(n, record.nodes[n])
+        for (i, j), entry in record.mass.items():
+            self._plan_entry(i, j, *entry)
+        self._distinct = list(dict.fromkeys(self.products.values()))
+        #: Series whose sums are wanted: the cotangents, and the integrals that belong to weights.
+        self._found = [
+            *(self._slot(kind, i) for kind in ("q bar", "v bar") for i in range(self.size)),
+            *(self._slot("weight bar", i) for i in range(len(self._active))),
         ]
-        self._bars = {slot: first + i for i, slot in enumerate(kept)}
-        self._cells = {key: i for i, key in enumerate([*record.mass, *self._active])}
+        self.slots = len(self.slot_of)
 
     @property
     def entries(self) -> int:
-        """How many numbers a lane needs: coefficients, and pairs of cotangents."""
-        return STRIDE * (self.slots + 2 * self._bar_slots)
+        """How many coefficients a lane needs."""
+        return STRIDE * self.slots
 
-    @property
-    def _bar_slots(self) -> int:
-        """How many slots cotangents need, with those of masses and weights."""
-        return self._first_cell - self.slots - (-max(len(self._cells), 1) // STRIDE)
+    # --- which series are kept -----------------------------------------------------------------------------
 
-    @property
-    def _first_cell(self) -> int:
-        return self.slots + len(self._sums) + len(self._bars)
+    def _find_live(self) -> list[int]:
+        found = set(super()._find_live())
+        #: Nodes that g depends on, through the arguments of functions too.
+        self._reached: list[int] = []
+        pending = [*self.record.force, *(node for node, _, _ in self.record.mass.values())]
+        reached: set[int] = set()
+        while pending:
+            n = pending.pop()
+            if n >= 0 and n not in reached:
+                reached.add(n)
+                node = self.record.nodes[n]
+                pending += node.args[:1] if node.op in FUNCTIONS else node.args
+                if node.op == "sum":
+                    found |= {a for a, w in zip(node.args, node.weights, strict=False) if w in self._active}
+        self._reached = sorted(reached)
+        return sorted(found)
 
-    def _is_known(self, kind: str, i: int) -> bool:
-        return kind == "x" and self.record.nodes[i].op in KNOWN
+    def _plan_back(self, n: int, node: Node) -> None:
+        args = node.args
+        if node.op == "product":
+            self.products[n, 0] = self._slot("bar", n), self.factor_of(args[1])
+            self.products[n, 1] = self._slot("bar", n), self.factor_of(args[0])
+        elif node.op == "reciprocal":  # x̄ = -z̄ z z
+            self.products[n, 0] = self._slot("bar", n), self.factor_of(n)
+            self.products[n, 1] = self._slot("share", n), self.factor_of(n)
+        elif node.op == "sqrt":  # 2 x̄ z = z̄
+            self.products[n, 0] = self._slot("share", n), self.factor_of(n)
+        elif node.op in FUNCTIONS:
+            self.products[n, 0] = self._slot("bar", n), self.factor_of(args[1])
+        elif node.op == "sum":
+            for i, (a, w) in enumerate(zip(args, node.weights, strict=False)):
+                if w in self._active:
+                    self.products[n, i] = self._slot("bar", n), self.factor_of(a)
+
+    def _plan_entry(self, i: int, j: int, node: int, weight: Any, constant: Any) -> None:
+        if node < 0 and constant not in self._active:
+            return
+        for row, column in {(i, j), (j, i)}:
+            slot = self._slot("s", row)
+            self.products["entry", row, column] = slot, Factor(self._slot("a", column))
+            if node >= 0:
+                self.products["solve", column, row] = slot, self.factor_of(node)
+        if weight in self._active:
+            self.products["weight", i, j] = self._slot("entry bar", self.size * i + j), self.factor_of(node)
+
+    # --- the step ------------------------------------------------------------------------------------------
 
     def pull(
         self,
@@ -96,7 +130,7 @@ class Backward(Series):
             See `substep`.
         tolerance : number
             Allowed truncation error of v. If negative, the substep was taken before and is only taken
-            backwards: `lane` is its start, and the lane's wish is the certified length.
+            backwards: `lane` is its end, and the lane's wish is its length.
         bars : sequence of number
             Cotangents of places, then of velocities after the substep, then of the sources.
 
@@ -111,28 +145,31 @@ class Backward(Series):
             Whether lanes that ended their control step went backwards. They do not if they are only a few of
             the lanes of a vector.
         """
-        zero, again = t.number(0.0), t.less(tolerance, t.number(0.0))
+        zero, again, n = t.number(0.0), t.less(tolerance, t.number(0.0)), self.size
         wanted = t.both(t.negated(again), t.less(zero, lane.left))
-        inputs, h = self._before(t, inputs, lane, dt)
-        start = self.expand(t, inputs, lane.q, lane.v, h, order)
-        n = self.size
 
-        def certify() -> list:
-            found = self._certified(t, start, lane.q, h, order, tolerance, wanted)
+        def forwards() -> list:
+            ahead, wish = self._before(t, inputs, lane, dt)
+            found = self.attempt(t, ahead, lane.q, lane.v, wish, order, tolerance, wanted)
             after, _ = self._after(t, lane, order, wanted, *found)
             return [*after.q, *after.v, *after[2:]]
 
-        after = t.when(t.negated(t.all(again)), certify, [*lane.q, *lane.v, *lane[2:]])
-        lane = StepProgress(after[:n], after[n : 2 * n], *after[2 * n :])
-        ended = t.either(again, t.both(wanted, t.negated(t.less(zero, lane.left))))
+        found = t.when(t.negated(t.all(again)), forwards, [*lane.q, *lane.v, *lane[2:]])
+        after = StepProgress(found[:n], found[n : 2 * n], *found[2 * n :])
+        ended = t.either(again, t.both(wanted, t.negated(t.less(zero, after.left))))
         back = t.most(ended, wanted)
+        length = t.select(again, lane.wish, t.sub(lane.left, after.left))
 
-        def go_back() -> list:
-            rest, whole = self._back(t, start, h, order, bars)
+        def backwards() -> list:
+            behind = inputs
+            if ELAPSED in self.record.inputs:
+                behind = inputs | {ELAPSED: t.sub(dt, after.left)}
+            start = self.expand(t, behind, after.q, after.v, t.neg(length), order)
+            whole, rest = self._sweep(t, start, length, order, bars)
             found = [t.select(ended, new, old) for new, old in zip(whole, bars, strict=True)]
-            return [*found, self._largest_ratio(t, h, rest, whole, bars)]
+            return [*found, self._largest_ratio(t, length, rest, whole, bars)]
 
-        return lane, t.when(back, go_back, [*bars, zero]), back
+        return after, t.when(back, backwards, [*bars, zero]), back
 
     def _largest_ratio(self, t: Target, h: Any, parts: Sequence, *wholes: Sequence) -> Any:
         """Return the largest ratio of parts of cotangents to the cotangents before and after the step.
@@ -151,295 +188,227 @@ class Backward(Series):
             total = t.select(t.less(total, ratio), ratio, total)
         return total
 
-    def _back(
+    # --- the cotangents' series ----------------------------------------------------------------------------
+
+    def _sweep(
         self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence
     ) -> tuple[list, list]:
-        """Return what the cotangents leave out, estimated as in `following`, and the cotangents.
+        """Return the cotangents before the step just expanded at its end, and what they leave out.
 
-        They are those before the step just expanded, from those after it; see `pull`.
+        They come from those after it; what is left out is estimated as in `following`.
         """
-        both: Any = PairTarget(t, self.slots, self._bar_slots)
-        found = self._sweep(both, start, h, order, ends)
-        return [x.last for x in found], [x.whole for x in found]
+        first, n = t.index(0), self.size
+        initial = [*ends[: 2 * n], *[t.number(0.0)] * len(self._active)]
+        for slot, x in zip(self._found, initial, strict=True):
+            t.store(slot, first, x)
 
-    def _sweep(self, t: Any, start: ExpansionStart, h: Any, order: Any, ends: Sequence) -> list[Pair]:
-        """Return cotangents before the step, each with an estimate of what it leaves out."""
-        zero = t.number(0.0)
-        first, per_order = following(t, order)
-        self._clear(t, order)
-        n = self.size
+        def newest(k: Any, product: tuple[int, Factor], total: Any) -> Any:
+            """Add A_k B_1."""
+            return t.fma(t.load(product[0], k), product[1].load(t, t.index(1)), total)
 
-        def seed(m: Any, carried: Sequence) -> list:
-            k, (weight,) = t.minus(order, m), carried
-            per = t.mul(h, t.reciprocal(t.plus(k, 1)))
-            for i in range(n):
-                bar = t.fma(per, ends[i], ends[n + i])
-                t.store(self._bar("v", i), k, Pair(bar, t.mul(weight, bar)))
-            return [t.mul(weight, per_order)]
-
-        t.loop(t.index(0), t.plus(order, 1), [first], seed)
-        ends = [Pair(end, zero) for end in ends]
-
-        def back(m: Any, carried: Sequence) -> list:
-            self._one_order_back(t, start, h, t.minus(order, m), order)
+        def two_orders(k: Any, carried: Sequence) -> list:
+            sums = self._convolve_back(t, k)
+            self._one_order_back(t, start, h, k, lambda product: sums[product][0])
+            after = t.plus(k, 1)
+            self._one_order_back(t, start, h, after, lambda product: newest(k, product, sums[product][1]))
             return []
 
-        t.loop(t.index(1), order, [], back)
-        places, weights = self._first_order_back(t, start, h, order)
-        velocities = [t.load(self._bar("v", i), t.index(0)) for i in range(n)]
-        found = [total if x is None else t.add(x, total) for x, total in zip(places[:n], ends, strict=False)]
-        found += [
-            x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)
-        ]
-        sources = zip(self._sources, ends[2 * n :], strict=True)
-        return found + [self._of_source(t, start, weights, source, total) for source, total in sources]
+        half = t.half(order)
+        odd = t.minus(t.minus(order, half), half)
+        t.loop(first, odd, [], lambda k, carried: self._one_order_back(t, start, h, k, lambda product: None))
+        t.loop(odd, order, [], two_orders, step=2)
+        return self._collect(t, start, order, ends)
 
-    def _of_source(
-        self, t: Target, start: ExpansionStart, weights: dict[str, Any], source: str, total: Any
-    ) -> Any:
-        for name, bar in weights.items():
-            slope = self.record.tangents[name].get(source, 0.0)
-            if slope != 0.0:
-                total = t.fma(bar, self.weight(t, start.scalars, slope), total)
-        return total
+    def _convolve_back(self, t: Target, k: Any) -> dict:
+        """Return Σ_{j<k} A_j B_{k-j} and Σ_{j<k} A_j B_{k+1-j} for all products; see `_convolve`."""
+        sums: dict = {}
+        for some in alike(self._distinct, t.group):
+            sums |= self._convolve_group_back(t, k, some)
+        return sums
 
-    # --- cotangents in memory ------------------------------------------------------------------------------
+    def _convolve_group_back(self, t: Target, k: Any, products: Sequence[tuple[int, Factor]]) -> dict:
+        n = len(products)
+        lower = list(dict.fromkeys(a for a, _ in products))
+        upper = list(dict.fromkeys(b for _, b in products))
 
-    def _bar(self, kind: str, i: int) -> int:
-        return self._bars[self.slot_of[kind, i]]
+        def accumulate(j: Any, carried: Sequence) -> list:
+            other = t.minus(k, j)
+            x = {a: t.load(a, j) for a in lower}
+            y = {b: b.load(t, other) for b in upper}
+            last = dict(zip(upper, carried[2 * n :], strict=True))
+            even = [t.fma(x[a], y[b], total) for (a, b), total in zip(products, carried[:n], strict=True)]
+            odd = [
+                t.fma(x[a], last[b], total)
+                for (a, b), total in zip(products, carried[n : 2 * n], strict=True)
+            ]
+            return [*even, *odd, *y.values()]
 
-    def _clear(self, t: Target, order: Any) -> None:
-        zero = t.number(0.0)
+        begin = [*[t.number(0.0)] * (2 * n), *(b.load(t, t.plus(k, 1)) for b in upper)]
+        totals = t.loop(t.index(0), k, begin, accumulate)
+        return dict(zip(products, zip(totals[:n], totals[n : 2 * n], strict=True), strict=True))
 
-        def clear(k: Any, carried: Sequence) -> list:
-            for (kind, _), slot in self.slot_of.items():
-                if kind == "x" and slot in self._bars:
-                    t.store(self._bars[slot], k, zero)
-            return []
-
-        t.loop(t.index(0), order, [], clear)
-        for key in self._cells:
-            t.store(*self._cell(t, key), zero)
-
-    def _cell(self, t: Target, key: Any) -> tuple[int, Any]:
-        cell = self._cells[key]
-        return self._first_cell + cell // STRIDE, t.index(cell % STRIDE)
-
-    def _add(self, t: Target, slot: int, k: Any, a: Any, b: Any) -> None:
-        """Add a product to a number in memory."""
-        t.store(slot, k, t.fma(a, b, t.load(slot, k)))
-
-    def _weight_bar(self, t: Target, weight: Any, a: Any, b: Any) -> None:
-        if weight in self._active:
-            self._add(t, *self._cell(t, weight), a, b)
-
-    # --- one order -----------------------------------------------------------------------------------------
-
-    def _gather(self, t: Target, k: Any, order: Any, first: bool = False) -> dict[Factor, Any]:
-        """Return what sums of products of higher orders add to cotangents of factors of order k.
-
-        For factors whose cotangents are kept in slots, it is added there.
-        """
-        products: dict[Factor, list] = {}  # Σ_m P_m B_{m-k} is added to the cotangent of A_k
-        for key, (a, b) in self.pairs.items():
-            if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
-                products.setdefault(a, []).append((key, b))
-            if a != b:
-                products.setdefault(b, []).append((key, a))
-        factors, most, waiting = list(products), 2 * t.group, []
-        for begin in range(0, len(factors), most):
-            some = factors[begin : begin + most]
-
-            def later(i: Any, carried: Sequence, some: Sequence = some) -> list:
-                m, found = t.minus(order, i), []  # what was found last is added last
-                for factor, total in zip(some, carried, strict=True):
-                    for key, other in products[factor]:
-                        total = t.fma(t.load(self._sums[key], m), other.load(t, t.minus(m, k)), total)
-                    found.append(total)
-                return found
-
-            # Several chains of additions keep the processor busy. Their results wait in memory, so that the
-            # next chains find room in registers.
-            zero = Pair(t.number(0.0), t.number(0.0))
-            waiting.append(t.aside(t.loop(t.index(1), t.minus(order, k), [zero] * len(some), later)))
-        found = dict(zip(factors, (x for back in waiting for x in back()), strict=True))
-        for factor in [factor for factor in found if factor.slot in self._bars]:
-            total = found.pop(factor)
-            if not (first and factor.back):
-                self._add(t, self._bars[factor.slot], t.plus(k, -factor.back), t.number(1.0), total)
-        return found
-
-    def _solve_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, found: dict[Factor, Any]) -> list:
-        """Go back through M_0 a_k = r and v_{k+1} = h a_k/(k+1); return the cotangents of r."""
+    def _one_order_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, sum_of: Callable) -> list:
+        """Compute the coefficients of order k + 1, with Σ_{j<k} A_j B_{k-j} from `sum_of`; None is 0."""
+        order = _Order(self, t, start, k, sum_of)
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
-        a, bars = [], []
+        self._solve_back(order)
+        for i in reversed(self._reached):
+            node, bar = self.record.nodes[i], order.bars[i]
+            order.keep("bar", i, bar)
+            if node.op in KNOWN:
+                self._integrate_known(order, node, bar, h, step)
+            elif node.op == "sum":
+                self._sum_back(order, i, node, bar)
+            elif node.op in ("place", "velocity"):
+                order.add(order.moving, (node.op, node.index), bar)
+            else:
+                self._node_back(order, i, node, bar)
         for i in range(self.size):
-            slot = self.slot_of["a", i]
-            a.append(t.load(slot, k))
-            v_bar = t.load(self._bar("v", i), after)
-            own = found.get(Factor(slot))
-            bars.append(t.mul(step, v_bar) if own is None else t.fma(step, v_bar, own))
-        right = [t.number(0.0) if x is None else x for x in matrix_times(t, start.inverse.rows, bars)]
-        for i, j in self.record.mass:
-            less = t.mul(right[i], a[j])
-            less = less if i == j else t.fma(right[j], a[i], less)
-            cell = self._cell(t, (i, j))
-            t.store(*cell, t.sub(t.load(*cell), less))
-        return right
+            q_bar, v_bar = (self.slot_of[kind, i] for kind in ("q bar", "v bar"))
+            rate = t.load(q_bar, k)
+            if ("velocity", i) in order.moving:
+                rate = t.add(rate, order.moving["velocity", i])
+            t.store(v_bar, after, t.mul(step, rate))
+            t.store(q_bar, after, t.mul(step, order.moving.get(("place", i), t.number(0.0))))
+        for i, name in enumerate(self._active):
+            total = order.integrals.get(name, t.number(0.0))
+            total = t.fma(step, order.rates[name], total) if name in order.rates else total
+            t.store(self.slot_of["weight bar", i], after, total)
+        return []
 
-    def _one_order_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, order: Any) -> None:
-        """Take the cotangents of all coefficients of order k > 0 to those of lower ones."""
-        record, first = self.record, t.index(0)
-        found = self._gather(t, k, order)
-        bars: dict[int, Any] = {}
-        for n in self.live:
-            slot = self.slot_of.get(("x", n), -1)
-            if slot in self._bars and record.nodes[n].op not in KNOWN:
-                bars[n] = t.load(self._bars[slot], k)
-            elif Factor(slot) in found:
-                bars[n] = found[Factor(slot)]
-            if ("d", n) in self.slot_of and (bar := found.get(Factor(self.slot_of["d", n]))) is not None:
-                more = t.mul(t.real(k), bar)
-                bars[n] = t.add(bars[n], more) if n in bars else more
-
-        def add(n: int, a: Any, b: Any) -> None:
-            bars[n] = t.fma(a, b, bars[n]) if n in bars else t.mul(a, b)
-
-        right = self._solve_back(t, start, h, k, found)
-        one = t.number(1.0)
+    def _solve_back(self, order: _Order) -> None:
+        """Find σ with M σ = ν, and what it gives to forces and to entries of the mass matrix."""
+        t, record, scalars = order.t, self.record, order.start.scalars
+        right = [t.load(self.slot_of["v bar", i], order.k) for i in range(self.size)]
+        for (i, j), (node, weight, _) in record.mass.items():
+            for row, column in {(i, j), (j, i)} if node >= 0 else ():
+                if (less := order.before(("solve", row, column))) is not None:
+                    less = less if weight == 1.0 else t.mul(self.weight(t, scalars, weight), less)
+                    right[row] = t.sub(right[row], less)
+        found = matrix_times(t, order.start.inverse.rows, right)
+        s = [t.number(0.0) if x is None else x for x in found]
         for i, f in enumerate(record.force):
+            order.keep("s", i, s[i])
             if f >= 0:
-                add(f, right[i], one)
-        for (a, b), (node, weight, _) in record.mass.items():
-            if node < 0:
+                order.add(order.bars, f, s[i])
+        for (i, j), (node, weight, constant) in record.mass.items():
+            if node < 0 and constant not in self._active:
                 continue
-            for i, j in {(a, b), (b, a)}:
-                rate, factor = Factor(self.slot_of["a", j]), self.factor_of(node)
-                less = t.neg(right[i])
-                if weight in self._active:
-                    self._weight_bar(t, weight, less, self._product(t, k, factor, rate))
-                if weight != 1.0:
-                    less = t.mul(less, self.weight(t, start.scalars, weight))
-                add(node, less, rate.load(t, first))
-                t.store(self._sums[i, j], k, less)
-        for n in reversed(self.live):
-            if n in bars:
-                self._node_back(t, start, n, bars[n], h, k, add)
-            elif n in self.pairs:
-                t.store(self._sums[n], k, t.number(0.0))
+            bar = order.whole(("entry", i, j), s[i])
+            bar = t.neg(bar if i == j else t.add(bar, order.whole(("entry", j, i), s[j])))
+            if constant in self._active:
+                order.add(order.rates, constant, bar)
+            if weight in self._active:
+                order.keep("entry bar", self.size * i + j, bar)
+                order.add(order.rates, weight, order.whole(("weight", i, j), bar))
+            if node >= 0:
+                order.add(order.bars, node, bar, weight)
 
-    def _node_back(
-        self, t: Target, start: ExpansionStart, n: int, bar: Any, h: Any, k: Any, add: Callable
-    ) -> None:
-        """Take a node's cotangent of order k to what it was made of, and to its sum of products."""
-        node, zero = self.record.nodes[n], start.zero
-        op, args = node.op, node.args
-        if op == "place":
-            step = t.mul(h, t.reciprocal(k))
-            self._add(t, self._bar("v", node.index), t.plus(k, -1), step, bar)
-        elif op == "velocity" or op in KNOWN:
-            self._add(t, self._bars[self.factor_of(n).slot], k, bar, t.number(1.0))
-        elif op == "sum":
-            for a, weight in zip(args, node.weights, strict=False):
-                add(a, bar, self.weight(t, start.scalars, weight))
-                if weight in self._active:
-                    self._weight_bar(t, weight, bar, self.factor_of(a).load(t, k))
-        elif op == "product":
-            add(args[0], bar, zero[args[1]])
-            add(args[1], bar, zero[args[0]])
-            self._keep_sum(t, n, k, bar)
-        elif op == "reciprocal":  # Σ x_j z_{k-j} = 0
-            less = t.neg(t.mul(bar, zero[n]))
-            add(args[0], less, zero[n])
-            self._keep_sum(t, n, k, less)
-        elif op == "sqrt":  # Σ z_j z_{k-j} = x_k
-            half = t.mul(bar, t.div(t.number(0.5), zero[n]))
-            add(args[0], half, t.number(1.0))
-            self._keep_sum(t, n, k, t.neg(half))
-        else:  # k z_k = Σ_{j>0} D_j w_{k-j}
+    def _integrate_known(self, order: _Order, node: Node, bar: Any, h: Any, step: Any) -> None:
+        """Add to the integrals of z̄ t^m, which belong to a known series' weights; t is at most 0."""
+        t, power, after = order.t, step, order.t.plus(order.k, 1)
+        for m, weight in enumerate(node.weights):
+            if weight in self._active:
+                part = t.div(t.real(after), t.real(t.plus(after, m)))
+                order.add(order.integrals, weight, t.mul(bar, t.mul(power, part) if m else power))
+            power = t.neg(t.mul(power, h))
+
+    def _sum_back(self, order: _Order, n: int, node: Node, bar: Any) -> None:
+        for i, (a, weight) in enumerate(zip(node.args, node.weights, strict=False)):
+            order.add(order.bars, a, bar, weight)
+            if weight in self._active:
+                order.add(order.rates, weight, order.whole((n, i), bar))
+        if node.weights[-1] in self._active:
+            order.add(order.rates, node.weights[-1], bar)
+
+    def _node_back(self, order: _Order, n: int, node: Node, bar: Any) -> None:
+        t, op, args, bars = order.t, node.op, node.args, order.bars
+        if op == "product":
+            order.add(bars, args[0], order.whole((n, 0), bar))
+            order.add(bars, args[1], order.whole((n, 1), bar))
+        elif op == "reciprocal":
+            share = order.whole((n, 0), bar)
+            order.keep("share", n, share)
+            order.add(bars, args[0], order.whole((n, 1), share), -1.0)
+        elif op == "sqrt":
+            total, half = order.before((n, 0)), t.mul(t.number(0.5), bar)
+            share = t.div(half if total is None else t.sub(half, total), order.start.zero[n])
+            order.keep("share", n, share)
+            order.add(bars, args[0], share)
+        else:  # z' = w x'; of a cosine, w is the sine
             assert op in FUNCTIONS
-            slope = self.slope_of(n)
-            bar = t.neg(bar) if op == "cos" else bar
-            scaled = t.mul(t.reciprocal(k), bar)
-            if slope.back:  # D is h times the argument's rate
-                scaled = t.mul(h, scaled)
-                self._add(t, self._bars[slope.slot], t.plus(k, -1), scaled, zero[args[1]])
-            else:
-                add(args[0], bar, zero[args[1]])
-            self._keep_sum(t, n, k, scaled)
+            order.add(bars, args[0], order.whole((n, 0), bar), -1.0 if op == "cos" else 1.0)
 
-    def _keep_sum(self, t: Target, n: int, k: Any, bar: Any) -> None:
-        """Store the cotangent of a node's sum of products, twice where both factors are the same."""
-        a, b = self.pairs[n]
-        t.store(self._sums[n], k, t.add(bar, bar) if a == b else bar)
+    def _collect(self, t: Target, start: ExpansionStart, order: Any, ends: Sequence) -> tuple[list, list]:
+        """Return the sums of the series, small terms first, and what they leave out."""
+        first, per_order = following(t, order)
+        count, zero = len(self._found), t.number(0.0)
 
-    def _product(self, t: Target, k: Any, a: Factor, b: Factor) -> Any:
-        """Return Σ_{0<j<=k} A_j B_{k-j}."""
+        def down(m: Any, carried: Sequence) -> list:
+            (weight, *sums), k = carried, t.minus(order, m)
+            terms = [t.load(slot, k) for slot in self._found]
+            wholes = [t.add(total, x) for total, x in zip(sums[:count], terms, strict=True)]
+            parts = [t.fma(weight, t.abs(x), total) for total, x in zip(sums[count:], terms, strict=True)]
+            return [t.mul(weight, per_order), *wholes, *parts]
 
-        def total(j: Any, carried: Sequence) -> list:
-            return [t.fma(a.load(t, j), b.load(t, t.minus(k, j)), carried[0])]
+        _, *sums = t.loop(t.index(0), t.plus(order, 1), [first, *[zero] * (2 * count)], down)
+        wholes, parts = sums[:count], sums[count:]
+        moving = 2 * self.size
+        found, rest = wholes[:moving], parts[:moving]
+        for source, total in zip(self._sources, ends[moving:], strict=True):
+            part = zero
+            for name, bar, more in zip(self._active, wholes[moving:], parts[moving:], strict=True):
+                slope = self.record.tangents[name].get(source, 0.0)
+                if slope != 0.0:
+                    slope = self.weight(t, start.scalars, slope)
+                    total, part = t.fma(bar, slope, total), t.fma(more, t.abs(slope), part)
+            found.append(total)
+            rest.append(part)
+        return found, rest
 
-        (found,) = t.loop(t.index(1), t.plus(k, 1), [t.number(0.0)], total)
-        return found
 
-    # --- order 0 -------------------------------------------------------------------------------------------
+class _Order:
+    """The coefficients of order k while they are computed.
 
-    def _first_order_back(
-        self, t: Target, start: ExpansionStart, h: Any, order: Any
-    ) -> tuple[list, dict[str, Any]]:
-        """Return cotangents of places and velocities (None: zero), and of the active weights."""
-        record, zero, first, n = self.record, start.zero, t.index(0), self.size
-        gathered = self._gather(t, first, order, first=True)
-        bars: dict[int, Any] = {}
-        for (kind, i), slot in self.slot_of.items():
-            if kind == "x" and slot in self._bars:
-                bars[i] = t.load(self._bars[slot], first)
-            elif kind == "x" and Factor(slot) in gathered:
-                bars[i] = gathered[Factor(slot)]
-        found: list[Any] = [None] * (2 * n)
+    Attributes
+    ----------
+    bars : dict
+        Derivatives of g by nodes.
+    moving : dict
+        By places and velocities.
+    rates, integrals : dict
+        By weights; and the coefficients of order k + 1 of their integrals, where these are known already.
+    """
 
-        def add(to: Any, key: int, a: Any, b: Any) -> None:
-            old = to.get(key) if isinstance(to, dict) else to[key]
-            to[key] = t.mul(a, b) if old is None else t.fma(a, b, old)
+    def __init__(self, step: Backward, t: Target, start: ExpansionStart, k: Any, sum_of: Callable) -> None:
+        self._step, self._sum_of = step, sum_of
+        self.t, self.start, self.k = t, start, k
+        self.bars: dict[int, Any] = {}
+        self.moving: dict[tuple[str, int], Any] = {}
+        self.rates: dict[Any, Any] = {}
+        self.integrals: dict[Any, Any] = {}
 
-        one = t.number(1.0)
-        for f, bar in zip(record.force, self._solve_back(t, start, h, first, gathered), strict=True):
-            if f >= 0:
-                add(bars, f, bar, one)
-        for place, (entry, weight, constant) in record.mass.items():
-            bar = t.load(*self._cell(t, place))
-            self._weight_bar(t, constant, bar, one)
-            if entry >= 0:
-                add(bars, entry, bar, self.weight(t, start.scalars, weight))
-                self._weight_bar(t, weight, bar, zero[entry])
-        for i in reversed(range(len(record.nodes))):
-            node = record.nodes[i]
-            op, args = node.op, node.args
-            if op in KNOWN and ("x", i) in self.slot_of:
-                power = h
-                for k, w in enumerate(node.weights[1:], 1):
-                    self._weight_bar(t, w, power, t.load(self._bar("x", i), t.index(k)))
-                    power = t.mul(power, h)
-            if i not in bars:
-                continue
-            bar = bars[i]
-            if op in ("place", "velocity"):
-                add(found, node.index + n * (op == "velocity"), bar, one)
-            elif op in KNOWN:
-                self._weight_bar(t, node.weights[0], bar, one)
-            elif op == "sum":
-                self._weight_bar(t, node.weights[-1], bar, one)
-                for a, w in zip(args, node.weights, strict=False):
-                    add(bars, a, bar, self.weight(t, start.scalars, w))
-                    self._weight_bar(t, w, bar, zero[a])
-            elif op == "product":
-                add(bars, args[0], bar, zero[args[1]])
-                add(bars, args[1], bar, zero[args[0]])
-            elif op == "reciprocal":
-                add(bars, args[0], bar, t.neg(t.mul(zero[i], zero[i])))
-            elif op == "sqrt":
-                add(bars, args[0], bar, t.div(t.number(0.5), zero[i]))
-            else:
-                add(bars, args[0], t.neg(bar) if op == "cos" else bar, zero[args[1]])
-        return found, {name: t.load(*self._cell(t, name)) for name in self._active}
+    def before(self, key: tuple) -> Any:
+        """Return a product's sum without its last term, A_k B_0."""
+        return self._sum_of(self._step.products[key])
+
+    def whole(self, key: tuple, newest: Any) -> Any:
+        """Return a product's sum, where A_k is the newest coefficient."""
+        total, last = self.before(key), self._step.products[key][1].load(self.t, self.t.index(0))
+        return self.t.mul(newest, last) if total is None else self.t.fma(newest, last, total)
+
+    def add(self, to: dict, key: Any, x: Any, weight: Any = 1.0) -> None:
+        """Add a weight times a number to an entry."""
+        t = self.t
+        if isinstance(weight, float) and abs(weight) == 1.0:
+            x = x if weight > 0.0 else t.neg(x)
+            to[key] = t.add(to[key], x) if key in to else x
+        else:
+            weight = self._step.weight(t, self.start.scalars, weight)
+            to[key] = t.fma(weight, x, to[key]) if key in to else t.mul(weight, x)
+
+    def keep(self, kind: str, i: int, value: Any) -> None:
+        """Store a coefficient if it is needed later."""
+        if (kind, i) in self._step.slot_of:
+            self.t.store(self._step.slot_of[kind, i], self.k, value)

@@ -23,7 +23,7 @@ from lag_envs.stepping.machine import (
     compile_series_tangent,
     registers,
 )
-from lag_envs.stepping.series import TOLERANCE, Series
+from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
 LARGEST_COUNT = 20_000
@@ -33,9 +33,9 @@ SMALLEST_PART = 1e-9
 COMPLETE = 1e-13
 #: Last terms of derivatives below this part of them may be rounding errors.
 ROUNDED = 2e-15
-#: Steep functions, and the part of the usual tolerance with which their records are stepped for reverse mode:
-#: derivatives leave out far more than the motion.
-STEEP, STRICTER = {"atan", "tanh"}, 1e-3
+#: Steep functions. Their derivatives leave out far more than the motion. For reverse mode, their records are
+#: stepped with this part of the usual tolerance, and with so many terms more.
+STEEP, STRICTER, FURTHER = {"atan", "tanh"}, 1e-3, 4
 #: A part of the control step that derivatives alone do not divide further.
 SHORT = 1e-6
 
@@ -293,12 +293,13 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
     afterwards, last round first, again many lanes together.
     """
     wanted, count = len(pulled), given.shape[1]
-    table, before = np.zeros((bounds + wanted + 1, BLOCK)), np.empty((2 * n + 1, BLOCK))
+    order = min(order + further, LARGEST_ORDER)
+    table, before = np.zeros((bounds + wanted + 1, BLOCK)), np.empty(BLOCK)
     inputs, bars = np.empty((q, BLOCK)), np.empty((wanted, BLOCK))
     again = np.zeros_like(table)
     rows, rows_again = table.reshape(-1), again.reshape(-1)
-    # Columns of `kept` are substeps: places, velocities, the rest of the step, the substep's length. `lanes`
-    # holds the lane of each column, `rounds` the end of each round's columns.
+    # Columns of `kept` are substeps: places, velocities and the rest of the step after them, then their
+    # lengths. `lanes` holds the lane of each column, `rounds` the end of each round's columns.
     kept, lanes = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64)
     rounds, whose = np.empty(64, np.int64), np.empty(BLOCK, np.int64)
     for first in range(0, count, BLOCK):
@@ -329,30 +330,27 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
                 lanes = np.concatenate((lanes, np.empty_like(lanes)))
             if turns == len(rounds):
                 rounds = np.concatenate((rounds, np.empty_like(rounds)))
-            for r in range(2 * n):
-                put(before[r], table[q + r], BLOCK)
-            put(before[2 * n], table[left], BLOCK)
+            put(before, table[left], BLOCK)
             still = 0
             for begin in range(0, going, LANES):
                 back = pull(rows, begin, dt, order, tolerance) > 0
                 until = min(begin + LANES, going)
                 if back:
                     for r in range(wanted):
-                        row, bar = table[bounds + r], bars[r]
                         for i in range(begin, until):
-                            bar[whose[i]] = row[i]
+                            bars[r, whose[i]] = table[bounds + r, i]
                 for i in range(begin, until):
                     remains = table[left, i]
-                    used = before[2 * n, i] - remains
+                    used = before[i] - remains
                     lane = first + whose[i]
                     if used > 0.0 and back and remains == 0.0:
                         longest[lane] = min(
                             longest[lane], enough_of(used, dt, table[bounds + wanted, i], order)
                         )
                     elif used > 0.0:
-                        for r in range(2 * n + 1):
-                            kept[r, end] = before[r, i]
-                        kept[2 * n + 1, end] = used
+                        for r in range(2 * n):
+                            kept[r, end] = table[q + r, i]
+                        kept[2 * n, end], kept[2 * n + 1, end] = remains, used
                         lanes[end] = whose[i]
                         end += 1
                     if remains > 0.0:
@@ -420,8 +418,9 @@ def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = max(4, registers().doubles)  # even small series take many numbers on the way back
     steep = any(node.op in STEEP for node in record.nodes)
-    tolerance = TOLERANCE * (STRICTER if steep else 1.0)
-    numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
+    numbers = _numbers(record, TOLERANCE * (STRICTER if steep else 1.0))
+    numbers |= {"BLOCK": BLOCK, "LANES": width}
+    numbers |= {"further": FURTHER if steep else 0, "LARGEST_ORDER": LARGEST_ORDER}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     helpers = compile_pull(record, sources, width), _compile_lengths()[0], *loops
     return compile_python("pull_all", _pull_all, *helpers, **numbers)

@@ -22,7 +22,6 @@ from lag_envs.stepping import (
     elementary,
     lowering,
     matrices,
-    paired,
     primitives,
     series,
     target,
@@ -287,7 +286,7 @@ class Machine:
 def _version() -> str:
     """Return a digest of all that decides what is printed: this code, registers, and the length of rows."""
     modules = (
-        *(algebra, backward, certificate, dual, elementary, lowering, matrices, paired, primitives),
+        *(algebra, backward, certificate, dual, elementary, lowering, matrices, primitives),
         *(series, target, tracing),
     )
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(

@@ -71,6 +71,12 @@ def following(t: Target, order: Any) -> tuple[Any, Any]:
     return first, t.mul(first, t.number(1.0 / 3.0))
 
 
+def alike(items: Sequence, most: int) -> list[Sequence]:
+    """Return as few groups of at most `most` items as there can be, nearly equal: a small one wastes time."""
+    n, count = len(items), -(-len(items) // most)
+    return [items[i * n // count : (i + 1) * n // count] for i in range(count)]
+
+
 class Factor(NamedTuple):
     """A factor of a convolution: its coefficient of order k is entry k - back of a slot."""
 
@@ -337,8 +343,8 @@ class Series:
         squares = [pair for pair in self.distinct_pairs if pair[0] == pair[1]]
         sums: dict = {}
         for pairs, end in ((unlike, k), (squares, t.half(k))):
-            for first in range(0, len(pairs), t.group):
-                sums |= self._convolve_group(t, k, pairs[first : first + t.group], end)
+            for some in alike(pairs, t.group):
+                sums |= self._convolve_group(t, k, some, end)
         return sums
 
     def _convolve_group(self, t: Target, k: Any, pairs: Sequence[tuple[Factor, Factor]], end: Any) -> dict:

@@ -10,13 +10,9 @@ import numpy as np
 
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.series import LARGEST_ORDER
 
 if TYPE_CHECKING:
     from lag_envs.stepping.general import SeriesStepper
-
-#: How many terms more the series of derivatives has.
-FURTHER = 1
 
 
 class SeriesTangent:
@@ -127,38 +123,33 @@ class SeriesTangent:
     def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
         """Return gradients with respect to states, controls and parameters from those of the end states.
 
-        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`. The
-        series goes further than `order`: derivatives need some terms more than the motion, and a step that
-        is taken again, shorter, costs more than they do.
+        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
         """
         if self._stepper.mechanics.coupling:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
-        further = min(order + FURTHER, LARGEST_ORDER)
         linear = self._known_linear.get(dt) or self._linear(dt)
         self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
         given, seeds = np.concatenate([states.T, controls.T]), np.ascontiguousarray(cotangents.T)
         found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
-        some = np.arange(len(states))
-        while len(some):  # again those whose substeps were too long for the derivatives
-            every = len(some) == len(states)
-            shorter, pulled = longest[some], found if every else np.empty((self._width, len(some)))
-            parts = (given, seeds) if every else (given[:, some].copy(), seeds[:, some].copy())
-            if refused := self._pull(*parts, pulled, shorter, *linear, dt, further):
+        rows: Any = np.arange(len(states))
+        some: Any = slice(None)
+        while len(rows):  # all at first, then those whose substeps were too long for the derivatives
+            before, parts = longest[some], [np.ascontiguousarray(x[:, some]) for x in (given, seeds, found)]
+            shorter = before.copy()
+            if refused := self._pull(*parts, shorter, *linear, dt, order):
                 # In reverse mode no substep is longer than the shortest, so there may be too many. In forward
                 # mode substeps grow again.
-                i = some[refused - 1 : refused]
+                i = rows[refused - 1 : refused]
                 slopes, refused = self.jacobian(states[i], controls[i], dt, order)
                 if refused:
                     return None, int(i[0]) + 1
                 found[:, i] = np.einsum("ni,nij->jn", cotangents[i], slopes)
-                some = np.setdiff1d(some, i)
+                some = rows = np.setdiff1d(rows, i)
                 continue
-            if not every:
-                found[:, some] = pulled
-            too_long = shorter < longest[some]
+            found[:, some], too_long = parts[-1], shorter < before
             longest[some] = shorter
-            some = some[too_long]
+            some = rows = rows[too_long]
         return found.T, 0
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
