@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, KNOWN, Node, SeriesRecord
+from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, Node, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
 from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, alike, following
 from lag_envs.stepping.target import Target
@@ -149,9 +149,7 @@ class Backward(Series):
         wanted = t.both(t.negated(again), t.less(zero, lane.left))
 
         def forwards() -> list:
-            ahead, wish = self._before(t, inputs, lane, dt)
-            found = self.attempt(t, ahead, lane.q, lane.v, wish, order, tolerance, wanted)
-            after, _ = self._after(t, lane, order, wanted, *found)
+            after, _ = self.substep(t, inputs, lane, dt, order, tolerance)
             return [*after.q, *after.v, *after[2:]]
 
         found = t.when(t.negated(t.all(again)), forwards, [*lane.q, *lane.v, *lane[2:]])
@@ -161,10 +159,8 @@ class Backward(Series):
         length = t.select(again, lane.wish, t.sub(lane.left, after.left))
 
         def backwards() -> list:
-            behind = inputs
-            if ELAPSED in self.record.inputs:
-                behind = inputs | {ELAPSED: t.sub(dt, after.left)}
-            start = self.expand(t, behind, after.q, after.v, t.neg(length), order)
+            here = self.at(t, inputs, dt, after.left)
+            start = self.expand(t, here, after.q, after.v, t.neg(length), order)
             whole, rest = self._sweep(t, start, length, order, bars)
             found = [t.select(ended, new, old) for new, old in zip(whole, bars, strict=True)]
             return [*found, self._largest_ratio(t, length, rest, whole, bars)]
@@ -213,7 +209,7 @@ class Backward(Series):
             self._one_order_back(t, start, h, after, lambda product: newest(k, product, sums[product][1]))
             return []
 
-        half = t.half(order)
+        half = t.half(order)  # with an odd number of orders, the first is computed alone
         odd = t.minus(t.minus(order, half), half)
         t.loop(first, odd, [], lambda k, carried: self._one_order_back(t, start, h, k, lambda product: None))
         t.loop(odd, order, [], two_orders, step=2)
@@ -369,16 +365,14 @@ class Backward(Series):
 
 
 class _Order:
-    """The coefficients of order k while they are computed.
+    """What an order gives, while it is computed.
 
     Attributes
     ----------
-    bars : dict
-        Derivatives of g by nodes.
-    moving : dict
-        By places and velocities.
-    rates, integrals : dict
-        By weights; and the coefficients of order k + 1 of their integrals, where these are known already.
+    bars, moving, rates : dict
+        Coefficients of order k of the derivatives of g by nodes, by places and velocities, and by weights.
+    integrals : dict
+        Coefficients of order k + 1 of the integrals that belong to weights of known series.
     """
 
     def __init__(self, step: Backward, t: Target, start: ExpansionStart, k: Any, sum_of: Callable) -> None:

@@ -289,8 +289,8 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
     respect to the state, followed by `direct`.
 
     Lanes are moved together as in `_unfinished`. The substep that ends a step usually goes backwards at
-    once, using the series just expanded. All other substeps are stored, round by round, and go backwards
-    afterwards, last round first, again many lanes together.
+    once. The ends of all others are stored, round by round, and go backwards afterwards, last round first,
+    again many lanes together.
     """
     wanted, count = len(pulled), given.shape[1]
     order = min(order + further, LARGEST_ORDER)

@@ -519,12 +519,6 @@ class Series:
             Bounds on what v leaves out; q leaves out at most h/(N+2) times as much.
         """
         start = self.expand(t, inputs, q, v, h, order)
-        return self._certified(t, start, q, h, order, tolerance, wanted)
-
-    def _certified(
-        self, t: Target, start: ExpansionStart, q: Sequence, h: Any, order: Any, tolerance: Any, wanted: Any
-    ) -> tuple[Any, Any, list, list, list]:
-        """Do what `attempt` does, after the expansion."""
         certificate = Certificate(self, t, start, h, order, tolerance)
         one = t.number(1.0)
 
@@ -582,33 +576,11 @@ class Series:
         bounds : list of number
             Bounds on what places and velocities leave out.
         """
-        wanted = t.less(t.number(0.0), lane.left)
-        inputs, wish = self._before(t, inputs, lane, dt)
-        found = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
-        return self._after(t, lane, order, wanted, *found)
-
-    def _before(
-        self, t: Target, inputs: dict[str, Any], lane: StepProgress, dt: Any
-    ) -> tuple[dict[str, Any], Any]:
-        """Return a substep's inputs and its length."""
-        if ELAPSED in self.record.inputs:
-            inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
-        return inputs, self._within_lags(t, inputs, lane.wish)
-
-    def _after(
-        self,
-        t: Target,
-        lane: StepProgress,
-        order: Any,
-        wanted: Any,
-        done: Any,
-        tried: Any,
-        q: Sequence,
-        v: Sequence,
-        bounds: Sequence,
-    ) -> tuple[StepProgress, list]:
-        """Return what `substep` does, from what `attempt` found."""
         zero = t.number(0.0)
+        wanted = t.less(zero, lane.left)
+        inputs = self.at(t, inputs, dt, lane.left)
+        wish = self._within_lags(t, inputs, lane.wish)
+        done, tried, q, v, bounds = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
         done = t.both(done, wanted)
         used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
@@ -624,6 +596,10 @@ class Series:
         per = t.mul(used, t.reciprocal(t.plus(order, 2)))
         bounds = [*(t.mul(per, bound) for bound in bounds), *bounds]
         return after, [t.select(done, bound, zero) for bound in bounds]
+
+    def at(self, t: Target, inputs: dict[str, Any], dt: Any, left: Any) -> dict[str, Any]:
+        """Return the inputs when so much is left of a control step dt."""
+        return inputs | {ELAPSED: t.sub(dt, left)} if ELAPSED in self.record.inputs else inputs
 
 
 def _slope_of_tanh(t: Target, x: Any) -> Any:
