@@ -79,7 +79,10 @@ def test_jacobian_is_the_derivative(case):
                 ends.append(exact_step(scene, moved[: len(state)], moved[len(state) :], dt))
             columns.append([float(x) for x in (ends[0] - ends[1]) / (2 * h)])
     expected = np.array(columns).T
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
+    n = len(state)
+    by_state, by_control = scene.vjp([state] * n, [control] * n, dt, np.eye(n))
+    for slopes in (found, np.concatenate([by_state, by_control], axis=1)):
+        np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
 def oracle(case):
