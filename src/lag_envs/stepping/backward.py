@@ -21,7 +21,7 @@ from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, Node, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
-from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, alike, following
+from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, evenly, following
 from lag_envs.stepping.target import Target
 
 
@@ -44,8 +44,8 @@ class Backward(Series):
         ]
         super().__init__(record)
         del self.slots  # more series are needed than for the step
-        #: Products of a cotangent's series (its slot) with one of the motion, by what needs them.
-        self.products: dict[tuple, tuple[int, Factor]] = {}
+        #: Products of a cotangent's series with one of the motion, by what needs them.
+        self.products: dict[tuple, tuple[Factor, Factor]] = {}
         for n in self._reached:
             self._plan_back(n, record.nodes[n])
         for (i, j), entry in record.mass.items():
@@ -67,8 +67,6 @@ class Backward(Series):
 
     def _find_live(self) -> list[int]:
         found = set(super()._find_live())
-        #: Nodes that g depends on, through the arguments of functions too.
-        self._reached: list[int] = []
         pending = [*self.record.force, *(node for node, _, _ in self.record.mass.values())]
         reached: set[int] = set()
         while pending:
@@ -79,36 +77,41 @@ class Backward(Series):
                 pending += node.args[:1] if node.op in FUNCTIONS else node.args
                 if node.op == "sum":
                     found |= {a for a, w in zip(node.args, node.weights, strict=False) if w in self._active}
+        #: Nodes that g depends on, through the arguments of functions too.
         self._reached = sorted(reached)
         return sorted(found)
 
     def _plan_back(self, n: int, node: Node) -> None:
+        def plan(i: int, kind: str, other: int) -> None:
+            self.products[n, i] = Factor(self._slot(kind, n)), self.factor_of(other)
+
         args = node.args
         if node.op == "product":
-            self.products[n, 0] = self._slot("bar", n), self.factor_of(args[1])
-            self.products[n, 1] = self._slot("bar", n), self.factor_of(args[0])
+            plan(0, "bar", args[1])
+            plan(1, "bar", args[0])
         elif node.op == "reciprocal":  # x̄ = -z̄ z z
-            self.products[n, 0] = self._slot("bar", n), self.factor_of(n)
-            self.products[n, 1] = self._slot("share", n), self.factor_of(n)
+            plan(0, "bar", n)
+            plan(1, "share", n)
         elif node.op == "sqrt":  # 2 x̄ z = z̄
-            self.products[n, 0] = self._slot("share", n), self.factor_of(n)
+            plan(0, "share", n)
         elif node.op in FUNCTIONS:
-            self.products[n, 0] = self._slot("bar", n), self.factor_of(args[1])
+            plan(0, "bar", args[1])
         elif node.op == "sum":
             for i, (a, w) in enumerate(zip(args, node.weights, strict=False)):
                 if w in self._active:
-                    self.products[n, i] = self._slot("bar", n), self.factor_of(a)
+                    plan(i, "bar", a)
 
     def _plan_entry(self, i: int, j: int, node: int, weight: Any, constant: Any) -> None:
         if node < 0 and constant not in self._active:
             return
         for row, column in {(i, j), (j, i)}:
-            slot = self._slot("s", row)
-            self.products["entry", row, column] = slot, Factor(self._slot("a", column))
+            s = Factor(self._slot("s", row))
+            self.products["entry", row, column] = s, Factor(self._slot("a", column))
             if node >= 0:
-                self.products["solve", column, row] = slot, self.factor_of(node)
+                self.products["solve", column, row] = s, self.factor_of(node)
         if weight in self._active:
-            self.products["weight", i, j] = self._slot("entry bar", self.size * i + j), self.factor_of(node)
+            bar = Factor(self._slot("entry bar", self.size * i + j))
+            self.products["weight", i, j] = bar, self.factor_of(node)
 
     # --- the step ------------------------------------------------------------------------------------------
 
@@ -198,9 +201,9 @@ class Backward(Series):
         for slot, x in zip(self._found, initial, strict=True):
             t.store(slot, first, x)
 
-        def newest(k: Any, product: tuple[int, Factor], total: Any) -> Any:
+        def newest(k: Any, product: tuple[Factor, Factor], total: Any) -> Any:
             """Add A_k B_1."""
-            return t.fma(t.load(product[0], k), product[1].load(t, t.index(1)), total)
+            return t.fma(product[0].load(t, k), product[1].load(t, t.index(1)), total)
 
         def two_orders(k: Any, carried: Sequence) -> list:
             sums = self._convolve_back(t, k)
@@ -216,32 +219,12 @@ class Backward(Series):
         return self._collect(t, start, order, ends)
 
     def _convolve_back(self, t: Target, k: Any) -> dict:
-        """Return Σ_{j<k} A_j B_{k-j} and Σ_{j<k} A_j B_{k+1-j} for all products; see `_convolve`."""
+        """Return Σ_{j<k} A_j B_{k-j} and Σ_{j<k} A_j B_{k+1-j} for all products."""
         sums: dict = {}
-        for some in alike(self._distinct, t.group):
-            sums |= self._convolve_group_back(t, k, some)
+        for some in evenly(self._distinct, t.group):
+            last = {b: b.load(t, t.plus(k, 1)) for _, b in some}
+            sums |= self.sum_products(t, k, some, t.index(0), k, last)[0]
         return sums
-
-    def _convolve_group_back(self, t: Target, k: Any, products: Sequence[tuple[int, Factor]]) -> dict:
-        n = len(products)
-        lower = list(dict.fromkeys(a for a, _ in products))
-        upper = list(dict.fromkeys(b for _, b in products))
-
-        def accumulate(j: Any, carried: Sequence) -> list:
-            other = t.minus(k, j)
-            x = {a: t.load(a, j) for a in lower}
-            y = {b: b.load(t, other) for b in upper}
-            last = dict(zip(upper, carried[2 * n :], strict=True))
-            even = [t.fma(x[a], y[b], total) for (a, b), total in zip(products, carried[:n], strict=True)]
-            odd = [
-                t.fma(x[a], last[b], total)
-                for (a, b), total in zip(products, carried[n : 2 * n], strict=True)
-            ]
-            return [*even, *odd, *y.values()]
-
-        begin = [*[t.number(0.0)] * (2 * n), *(b.load(t, t.plus(k, 1)) for b in upper)]
-        totals = t.loop(t.index(0), k, begin, accumulate)
-        return dict(zip(products, zip(totals[:n], totals[n : 2 * n], strict=True), strict=True))
 
     def _one_order_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, sum_of: Callable) -> list:
         """Compute the coefficients of order k + 1, with Σ_{j<k} A_j B_{k-j} from `sum_of`; None is 0."""

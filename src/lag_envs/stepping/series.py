@@ -71,7 +71,7 @@ def following(t: Target, order: Any) -> tuple[Any, Any]:
     return first, t.mul(first, t.number(1.0 / 3.0))
 
 
-def alike(items: Sequence, most: int) -> list[Sequence]:
+def evenly(items: Sequence, most: int) -> list[Sequence]:
     """Return as few groups of at most `most` items as there can be, nearly equal: a small one wastes time."""
     n, count = len(items), -(-len(items) // most)
     return [items[i * n // count : (i + 1) * n // count] for i in range(count)]
@@ -343,14 +343,40 @@ class Series:
         squares = [pair for pair in self.distinct_pairs if pair[0] == pair[1]]
         sums: dict = {}
         for pairs, end in ((unlike, k), (squares, t.half(k))):
-            for some in alike(pairs, t.group):
+            for some in evenly(pairs, t.group):
                 sums |= self._convolve_group(t, k, some, end)
         return sums
 
     def _convolve_group(self, t: Target, k: Any, pairs: Sequence[tuple[Factor, Factor]], end: Any) -> dict:
+        zeros = dict.fromkeys((b for _, b in pairs), t.number(0.0))
+        sums, last = self.sum_products(t, k, pairs, t.index(1), end, zeros)
+        result = {}
+        for (a, b), (even, odd) in sums.items():
+            if a == b:  # the sums so far are one half, without the middle
+                middle = a.load(t, end)
+                even = t.fma(middle, middle, t.add(even, even))
+                odd = t.fma(middle, last[b], odd)
+                odd = t.add(odd, odd)
+            result[a, b] = even, odd
+        return result
+
+    def sum_products(
+        self,
+        t: Target,
+        k: Any,
+        pairs: Sequence[tuple[Factor, Factor]],
+        first: Any,
+        end: Any,
+        last: dict[Factor, Any],
+    ) -> tuple[dict, dict]:
+        """Return Σ A_j B_{k-j} and Σ A_j B_{k+1-j} over first <= j < end for some pairs.
+
+        `last` has B_{k+1-first}, or zeros to leave the first product of the second sum out. B_{k+1-end} is
+        returned too.
+        """
         n = len(pairs)
         lower = list(dict.fromkeys(a for a, _ in pairs))
-        upper = list(dict.fromkeys(b for _, b in pairs))
+        upper = list(last)
 
         def accumulate(j: Any, carried: Sequence) -> list:
             other = t.minus(k, j)
@@ -363,18 +389,9 @@ class Series:
             ]
             return [*even, *odd, *y.values()]
 
-        zeros = [t.number(0.0)] * (2 * n + len(upper))
-        totals = t.loop(t.index(1), end, zeros, accumulate)
-        last = dict(zip(upper, totals[2 * n :], strict=True))
-        result = {}
-        for (a, b), even, odd in zip(pairs, totals[:n], totals[n : 2 * n], strict=True):
-            if a == b:  # the sums so far are one half, without the middle
-                middle = a.load(t, end)
-                even = t.fma(middle, middle, t.add(even, even))
-                odd = t.fma(middle, last[b], odd)
-                odd = t.add(odd, odd)
-            result[a, b] = even, odd
-        return result
+        totals = t.loop(first, end, [*[t.number(0.0)] * (2 * n), *last.values()], accumulate)
+        sums = dict(zip(pairs, zip(totals[:n], totals[n : 2 * n], strict=True), strict=True))
+        return sums, dict(zip(upper, totals[2 * n :], strict=True))
 
     def _newest(self, t: Target, k: Any, pair: tuple[Factor, Factor], total: Any) -> Any:
         """Add A_1 B_k + A_k B_1."""
