@@ -152,7 +152,10 @@ def shows(page, name, wanted):
 
 @pytest.fixture(name="drive")
 def driver_page(browsing, bare):
-    """Open an environment's page and its driver; `slowly`, lest an episode end before a slow machine acts."""
+    """Open an environment's page and its driver.
+
+    With `slowly` it plays at a tenth of the speed, so that no episode ends before a slow machine has acted.
+    """
 
     def open_it(id=pivoted_bar.Balance.id, hash="", folder=bare, slowly=False, **options):
         page = browsing.open(f"{folder.as_uri()}/{id}.html{hash}", folder.as_uri(), **options)

@@ -46,6 +46,7 @@ class Backward(Series):
         del self.slots  # more series are needed than for the step
         #: Products of a cotangent's series with one of the motion, by what needs them.
         self.products: dict[tuple, tuple[Factor, Factor]] = {}
+        self._reached = self._find_reached()
         for n in self._reached:
             self._plan_back(n, record.nodes[n])
         for (i, j), entry in record.mass.items():
@@ -66,19 +67,21 @@ class Backward(Series):
     # --- which series are kept -----------------------------------------------------------------------------
 
     def _find_live(self) -> list[int]:
-        found = set(super()._find_live())
+        """Return the nodes whose series are kept, here also those that active weights multiply."""
+        sums = [node for n in self._find_reached() if (node := self.record.nodes[n]).op == "sum"]
+        pairs = [pair for node in sums for pair in zip(node.args, node.weights, strict=False)]
+        return sorted({*super()._find_live(), *(a for a, weight in pairs if weight in self._active)})
+
+    def _find_reached(self) -> list[int]:
+        """Return the nodes that g depends on, also through the arguments of functions."""
         pending = [*self.record.force, *(node for node, _, _ in self.record.mass.values())]
-        reached: set[int] = set()
+        found: set[int] = set()
         while pending:
             n = pending.pop()
-            if n >= 0 and n not in reached:
-                reached.add(n)
+            if n >= 0 and n not in found:
+                found.add(n)
                 node = self.record.nodes[n]
                 pending += node.args[:1] if node.op in FUNCTIONS else node.args
-                if node.op == "sum":
-                    found |= {a for a, w in zip(node.args, node.weights, strict=False) if w in self._active}
-        #: Nodes that g depends on, through the arguments of functions too.
-        self._reached = sorted(reached)
         return sorted(found)
 
     def _plan_back(self, n: int, node: Node) -> None:
@@ -162,7 +165,7 @@ class Backward(Series):
         length = t.select(again, lane.wish, t.sub(lane.left, after.left))
 
         def backwards() -> list:
-            here = self.at(t, inputs, dt, after.left)
+            here = self._inputs_at(t, inputs, dt, after.left)
             start = self.expand(t, here, after.q, after.v, t.neg(length), order)
             whole, rest = self._sweep(t, start, length, order, bars)
             found = [t.select(ended, new, old) for new, old in zip(whole, bars, strict=True)]
@@ -212,9 +215,12 @@ class Backward(Series):
             self._one_order_back(t, start, h, after, lambda product: newest(k, product, sums[product][1]))
             return []
 
-        half = t.half(order)  # with an odd number of orders, the first is computed alone
+        def one_order(k: Any, carried: Sequence) -> list:
+            return self._one_order_back(t, start, h, k, lambda product: t.number(0.0))
+
+        half = t.half(order)
         odd = t.minus(t.minus(order, half), half)
-        t.loop(first, odd, [], lambda k, carried: self._one_order_back(t, start, h, k, lambda product: None))
+        t.loop(first, odd, [], one_order)  # of an odd number of orders, the first alone
         t.loop(odd, order, [], two_orders, step=2)
         return self._collect(t, start, order, ends)
 
@@ -227,7 +233,7 @@ class Backward(Series):
         return sums
 
     def _one_order_back(self, t: Target, start: ExpansionStart, h: Any, k: Any, sum_of: Callable) -> list:
-        """Compute the coefficients of order k + 1, with Σ_{j<k} A_j B_{k-j} from `sum_of`; None is 0."""
+        """Compute the coefficients of order k + 1, with Σ_{j<k} A_j B_{k-j} from `sum_of`."""
         order = _Order(self, t, start, k, sum_of)
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
@@ -262,9 +268,9 @@ class Backward(Series):
         right = [t.load(self.slot_of["v bar", i], order.k) for i in range(self.size)]
         for (i, j), (node, weight, _) in record.mass.items():
             for row, column in {(i, j), (j, i)} if node >= 0 else ():
-                if (less := order.before(("solve", row, column))) is not None:
-                    less = less if weight == 1.0 else t.mul(self.weight(t, scalars, weight), less)
-                    right[row] = t.sub(right[row], less)
+                less = order.before(("solve", row, column))
+                less = less if weight == 1.0 else t.mul(self.weight(t, scalars, weight), less)
+                right[row] = t.sub(right[row], less)
         found = matrix_times(t, order.start.inverse.rows, right)
         s = [t.number(0.0) if x is None else x for x in found]
         for i, f in enumerate(record.force):
@@ -311,8 +317,8 @@ class Backward(Series):
             order.keep("share", n, share)
             order.add(bars, args[0], order.whole((n, 1), share), -1.0)
         elif op == "sqrt":
-            total, half = order.before((n, 0)), t.mul(t.number(0.5), bar)
-            share = t.div(half if total is None else t.sub(half, total), order.start.zero[n])
+            half = t.mul(t.number(0.5), bar)
+            share = t.div(t.sub(half, order.before((n, 0))), order.start.zero[n])
             order.keep("share", n, share)
             order.add(bars, args[0], share)
         else:  # z' = w x'; of a cosine, w is the sine
@@ -372,8 +378,8 @@ class _Order:
 
     def whole(self, key: tuple, newest: Any) -> Any:
         """Return a product's sum, where A_k is the newest coefficient."""
-        total, last = self.before(key), self._step.products[key][1].load(self.t, self.t.index(0))
-        return self.t.mul(newest, last) if total is None else self.t.fma(newest, last, total)
+        last = self._step.products[key][1].load(self.t, self.t.index(0))
+        return self.t.fma(newest, last, self.before(key))
 
     def add(self, to: dict, key: Any, x: Any, weight: Any = 1.0) -> None:
         """Add a weight times a number to an entry."""

@@ -418,9 +418,9 @@ def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = max(4, registers().doubles)  # even small series take many numbers on the way back
     steep = any(node.op in STEEP for node in record.nodes)
-    numbers = _numbers(record, TOLERANCE * (STRICTER if steep else 1.0))
-    numbers |= {"BLOCK": BLOCK, "LANES": width}
-    numbers |= {"further": FURTHER if steep else 0, "LARGEST_ORDER": LARGEST_ORDER}
+    stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
+    numbers = _numbers(record, TOLERANCE * stricter)
+    numbers |= {"BLOCK": BLOCK, "LANES": width, "further": further, "LARGEST_ORDER": LARGEST_ORDER}
     loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
     helpers = compile_pull(record, sources, width), _compile_lengths()[0], *loops
     return compile_python("pull_all", _pull_all, *helpers, **numbers)

@@ -595,7 +595,7 @@ class Series:
         """
         zero = t.number(0.0)
         wanted = t.less(zero, lane.left)
-        inputs = self.at(t, inputs, dt, lane.left)
+        inputs = self._inputs_at(t, inputs, dt, lane.left)
         wish = self._within_lags(t, inputs, lane.wish)
         done, tried, q, v, bounds = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
         done = t.both(done, wanted)
@@ -614,7 +614,7 @@ class Series:
         bounds = [*(t.mul(per, bound) for bound in bounds), *bounds]
         return after, [t.select(done, bound, zero) for bound in bounds]
 
-    def at(self, t: Target, inputs: dict[str, Any], dt: Any, left: Any) -> dict[str, Any]:
+    def _inputs_at(self, t: Target, inputs: dict[str, Any], dt: Any, left: Any) -> dict[str, Any]:
         """Return the inputs when so much is left of a control step dt."""
         return inputs | {ELAPSED: t.sub(dt, left)} if ELAPSED in self.record.inputs else inputs
 

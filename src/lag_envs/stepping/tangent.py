@@ -147,8 +147,8 @@ class SeriesTangent:
                 found[:, i] = np.einsum("ni,nij->jn", cotangents[i], slopes)
                 some = rows = np.setdiff1d(rows, i)
                 continue
-            found[:, some], too_long = parts[-1], shorter < before
-            longest[some] = shorter
+            too_long = shorter < before
+            found[:, some], longest[some] = parts[-1], shorter
             some = rows = rows[too_long]
         return found.T, 0
 
