@@ -15,6 +15,7 @@ from test_jacobian import exact_step
 from lag_envs.envs.model import Model
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
+from lag_envs.scenes.declaring import ORDER
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.normal_forms import lifted
 from lag_envs.tasks import TASKS
@@ -145,6 +146,18 @@ def test_vjp_is_the_jacobian_transposed(name):
         expected = np.einsum("...i,...ij->...j", seeds, matrix)
         size = np.einsum("...i,...ij->...j", np.abs(seeds), np.abs(matrix))
         np.testing.assert_array_less(np.abs(x - expected), 1e-12 * size + 1e-15)
+
+
+def test_vjp_with_an_odd_order():
+    """The first order is computed alone; of order 7, most steps are divided."""
+    scene, rng = CartPole(), np.random.default_rng(0)
+    states, seeds = rng.uniform(-1.0, 1.0, (2, 9, 4))
+    expected = scene.vjp(states, 1.0, 0.02, seeds)
+    for order in (7, 11):
+        chosen = CartPole()
+        vars(chosen)[ORDER] = order
+        for x, exact in zip(chosen.vjp(states, 1.0, 0.02, seeds), expected, strict=True):
+            np.testing.assert_allclose(x, exact, rtol=0.0, atol=1e-12)
 
 
 # --- whole steps --------------------------------------------------------------------------------------------
