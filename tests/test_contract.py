@@ -622,6 +622,20 @@ def test_parameters_of_sympys_expressions_are_numbers(number):
         Scene.from_sympy("Odd", m * q_dot**2, q**2, coordinates={q: "m"}, parameters={m: number})
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"coordinates": {"q": ["m"]}}, "Odd.coordinates: q must have a unit, got ['m']"),
+        ({"applied": {"q": {}}}, "Odd.applied: q must have an expression, got {}"),
+        ({"controls": {dynamicsymbols("s").diff(): "m"}}, "is a derivative, which cannot be a name; write"),
+        ({"controls": {dynamicsymbols("s", 2): "m"}}, "which cannot be a name; write 's_ddot'"),
+    ],
+)  # fmt: skip
+def test_units_and_names_of_sympys_expressions(given, message):
+    with pytest.raises(FormulaError, match=re.escape(message)):
+        Scene.from_sympy("Odd", "q_dot**2 / 2", "q**2", **{"coordinates": {"q": "m"}} | given)
+
+
 def test_symbols_of_sympys_expressions_that_only_look_alike():
     q, q_dot = sympy.Symbol("q", real=True), sympy.Symbol("q_dot")
     with pytest.raises(FormulaError, match="q_dot is not the declared symbol of that name"):

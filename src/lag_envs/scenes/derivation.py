@@ -90,7 +90,10 @@ def motion_constants_of(scene: Scene, lagged: bool = False) -> dict[str, float]:
 
 def undefined(scene: Scene) -> str:
     """Return the message for parameters for which a formula has no value."""
-    return f"with these parameters a coefficient of the motion is undefined or not finite: {scene}"
+    return (
+        f"with these parameters a coefficient of the motion is undefined or not finite: {scene}; "
+        "choose others, and state their range in the class"
+    )
 
 
 def _stepper(scene: Scene, lagged: bool) -> Any:

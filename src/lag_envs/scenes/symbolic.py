@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import unicodedata
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -167,8 +167,12 @@ def from_sympy(
             raise FormulaError(
                 f"{name}.{what} must be a dict from SymPy symbols, got {given!r:.60}"
             ) from None
-        if what == "parameters":
-            pairs = [(key, x if callable(x) else check_number(_name(key), x)) for key, x in pairs]
+        for i, (key, value) in enumerate(pairs):
+            if what == "parameters" and not callable(value):
+                pairs[i] = key, check_number(_name(key), value)
+            elif not isinstance(value, Hashable):
+                wanted = "an expression" if what == "applied" else "a unit"
+                raise FormulaError(f"{name}.{what}: {_name(key)} must have {wanted}, got {value!r:.60}")
         items.append((what, tuple(pairs)))
     formulas = tuple(
         (what, sympy.sympify(e))
@@ -252,6 +256,9 @@ def _name(symbol: Any) -> str:
         symbol = symbol.name
     if isinstance(symbol, str):
         return unicodedata.normalize("NFKC", symbol)
+    if isinstance(symbol, sympy.Derivative) and isinstance(symbol.expr, AppliedUndef):
+        rate = f"{symbol.expr.func.__name__}_{'d' * symbol.derivative_count}ot"
+        raise FormulaError(f"{symbol!r} is a derivative, which cannot be a name; write {rate!r}")
     raise FormulaError(f"{symbol!r} is neither a SymPy symbol nor a function of time; it cannot be a name")
 
 
