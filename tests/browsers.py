@@ -1,4 +1,4 @@
-"""A real browser for tests of the page: the system's Chromium, by Playwright."""
+"""A browser for tests of the page: the system's Chromium, by Playwright, if possible without windows."""
 
 import os
 import shutil
@@ -7,7 +7,8 @@ import warnings
 
 import pytest
 
-CHROMIUM = shutil.which(os.environ.get("CHROMIUM", "chromium"))
+_NAMED = os.environ.get("CHROMIUM")
+CHROMIUM = shutil.which(_NAMED or "chromium-headless-shell") or (None if _NAMED else shutil.which("chromium"))
 MISSING = (
     "THERE IS NO CHROMIUM, SO NO TEST OF THE LEADERBOARD'S PAGE IN A BROWSER WAS RUN: install chromium, or "
     "name one in the variable CHROMIUM"
@@ -58,11 +59,14 @@ def browsing(browser):
     found.close()
 
 
-def until(page, expression, wait=60.0):
-    """Wait until an expression is true; Playwright's own way uses eval, which the page's rules forbid."""
+def until(page, expression, right=bool, wait=60.0):
+    """Wait until an expression's value is right, by default true, and return it.
+
+    Playwright's own way uses eval, which the page's rules forbid.
+    """
     end = time.monotonic() + wait
-    while not (value := page.evaluate(expression)):
-        assert time.monotonic() < end, expression
+    while not right(value := page.evaluate(expression)):
+        assert time.monotonic() < end, (expression, value)
         page.wait_for_timeout(20)
     return value
 

@@ -1,8 +1,8 @@
 """Pages that are driven in a browser: fixtures, what they show, and their bits."""
 
+import json
 import math
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -135,19 +135,18 @@ def verdict(page):
 
 
 def reading(page, name):
-    return page.evaluate(
-        "(name) => [...document.querySelectorAll('.driver .readout dt')]"
-        ".find((e) => e.textContent === name)?.nextSibling.textContent",
-        name,
-    )
+    return page.evaluate(readout(name))
+
+
+def readout(name):
+    """Return the expression for a text of the read-out."""
+    return f"""[...document.querySelectorAll('.driver .readout dt')]
+        .find((e) => e.textContent === {json.dumps(name)})?.nextSibling.textContent"""
 
 
 def shows(page, name, wanted):
     """Wait until the read-out shows a text."""
-    end = time.monotonic() + 20.0
-    while reading(page, name) != wanted:
-        assert time.monotonic() < end, (name, reading(page, name), wanted)
-        page.wait_for_timeout(20)
+    until(page, readout(name), lambda text: text == wanted)
 
 
 @pytest.fixture(name="drive")

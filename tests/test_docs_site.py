@@ -257,7 +257,7 @@ def test_pictures_can_stand_still(site, browser):
         shown = "document.querySelector('.moving img').currentSrc"
         label = "document.querySelector('.moving button').textContent"
         for still in (motion == "reduce", motion != "reduce"):
-            until(page, f"{shown}.endsWith('-still.webp') === {str(still).lower()}", 10.0)
+            until(page, f"{shown}.endsWith('-still.webp') === {str(still).lower()}")
             assert page.evaluate(label) == ("Play the picture" if still else "Pause the picture")
             page.click(".moving button")
         page.close()

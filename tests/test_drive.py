@@ -11,6 +11,7 @@ from driving import (
     link_of,
     message,
     reading,
+    readout,
     shows,
     verdict,
 )
@@ -27,7 +28,7 @@ pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
 
 def test_by_keys_alone(drive, capsys):
     """Tab, arrows, Space, R and N; the command confirms the drive."""
-    page = drive(incline.Tilt.id, hash="#seed=12")
+    page = drive(incline.Tilt.id, hash="#seed=12", slowly=True)
     told = message(page)
     assert "← → rate of the tilt dφ/dt [rad/s]" in told and "Space or a click starts" in told
     page.focus("main")
@@ -38,7 +39,7 @@ def test_by_keys_alone(drive, capsys):
     assert page.evaluate("document.activeElement.getAttribute('role')") == "application"
     page.keyboard.down("ArrowRight")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
-    page.wait_for_timeout(300)
+    until(page, readout("Time"), lambda text: text > "0.1")
     page.keyboard.up("ArrowRight")
     page.keyboard.press("Space")
     assert message(page).startswith("Paused at 0.")
@@ -48,6 +49,8 @@ def test_by_keys_alone(drive, capsys):
     assert cli.main(["replay", held]) == 0
     said = capsys.readouterr().out
     assert "stopped before its end" in said and "score" not in said
+    page.select_option(".drive-controls select >> nth=0", "1")
+    page.focus(".stage")
     page.keyboard.press("Space")
     page.keyboard.down("ArrowRight")
     until(page, "/The episode has ended|Time is up/.test(document.querySelector('.message').textContent)")

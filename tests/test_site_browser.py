@@ -536,29 +536,35 @@ def test_the_documentations_choice_of_light_or_dark_is_followed(open_page, docum
     key, root = "/.__palette", f"{documented}/board"
     slate, default = (json.dumps({"color": {"scheme": name}}) for name in ("slate", "default"))
 
-    def look(page):
-        page.wait_for_timeout(50)  # observers
-        return page.evaluate("""[getComputedStyle(document.documentElement).colorScheme,
-            getComputedStyle(document.body).backgroundColor, document.querySelector('canvas').toDataURL()]""")
+    canvas = "document.querySelector('canvas')"
+    look = f"""[getComputedStyle(document.documentElement).colorScheme,
+        getComputedStyle(document.body).backgroundColor, {canvas}.toDataURL()]"""
+    blank = f"""Object.assign(document.createElement('canvas'),
+        {{ width: {canvas}.width, height: {canvas}.height }}).toDataURL()"""
+
+    def looks(page, wanted):
+        page.wait_for_timeout(50)  # what will change it has begun to
+        return until(page, look, lambda seen: seen == wanted)
 
     page = open_page("index", root, color_scheme="light")
-    light = look(page)
+    until(page, f"{canvas}.toDataURL() !== {blank}")
+    light = page.evaluate(look)
     page.emulate_media(color_scheme="dark")
-    dark = look(page)
-    assert (light[0], dark[0]) == ("light", "dark") and not set(light) & set(dark)
+    dark = until(page, look, lambda seen: not set(seen) & set(light))
+    assert (light[0], dark[0]) == ("light", "dark")
     rubbish = ("{", "null", "3", '{"color": 1}', '{"color": {"scheme": {}}}')
     for stored, wanted in ((default, light), (slate, dark), (default, light), *((x, dark) for x in rubbish)):
         page.evaluate("([key, value]) => { localStorage[key] = value; dispatchEvent(new Event('storage')); }",
                       [key, stored])  # fmt: skip
-        assert look(page) == wanted, stored
+        assert looks(page, wanted), stored
     stored = {"origin": documented, "localStorage": [{"name": key, "value": slate}]}
     page = open_page("index", root, color_scheme="light", storage_state={"cookies": [], "origins": [stored]})
-    assert look(page) == dark
+    assert looks(page, dark)
     early = "(e => !e.defer && !e.async && e.src.includes('/scheme-'))(document.querySelector('head script'))"
     assert page.evaluate(early), "it decides before the first paint"
     page.add_init_script("Object.defineProperty(window, 'localStorage', { get() { throw Error(); } })")
     page.reload()
-    assert look(page) == light
+    assert looks(page, light)
 
 
 @pytest.mark.parametrize(
