@@ -13,11 +13,15 @@ from covering import covering, slow, way
 from test_jacobian import exact_step
 
 from lag_envs.envs.model import Model
+from lag_envs.mechanics.evaluation import RATES, Numeric
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
+from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.declaring import ORDER
 from lag_envs.scenes.derivation import form_of
+from lag_envs.stepping import driver
 from lag_envs.stepping.normal_forms import lifted
+from lag_envs.stepping.tangent import SeriesTangent
 from lag_envs.tasks import TASKS
 
 
@@ -158,6 +162,90 @@ def test_vjp_with_an_odd_order():
         vars(chosen)[ORDER] = order
         for x, exact in zip(chosen.vjp(states, 1.0, 0.02, seeds), expected, strict=True):
             np.testing.assert_allclose(x, exact, rtol=0.0, atol=1e-12)
+
+
+class Twins(Scene):
+    """Two equal pendulums; a motor between them turns them against each other."""
+
+    length: float = parameter(0.5, "m", above=0.0)
+    damping: float = parameter(0.1, "N m s", least=0.0)
+
+    coordinates = {"a": "rad", "b": "rad"}
+    controls = {"motor": "N m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * self.length**2 * (v.a**2 + v.b**2)
+
+    def potential(self, q, xp):
+        return -9.81 * self.length * (xp.cos(q.a) + xp.cos(q.b))
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.damping * (v.a**2 + v.b**2)
+
+    def applied(self, q, v, u, xp):
+        return {"a": -u.motor, "b": u.motor}
+
+
+@pytest.fixture
+def rounds(monkeypatch):
+    """Return a list of how many rows go backwards together, round by round."""
+    found, compile_pull_all = [], driver.compile_pull_all.__wrapped__
+
+    def counting(*args):
+        pull = compile_pull_all(*args)
+
+        def pull_all(given, *rest):
+            found.append(given.shape[1])
+            pull(given, *rest)
+
+        return pull_all
+
+    monkeypatch.setattr(driver, "compile_pull_all", counting)
+    return found
+
+
+def test_a_gradient_that_cancels_does_not_divide_the_step(rounds):
+    """The motor turns both alike, so the sum does not depend on it; what is left out is small beside each."""
+    states, seeds = np.tile([0.7, 1.0], (40, 2)), np.tile([1.0, 0.5], (40, 2))
+    _, by_motor = Twins().vjp(states, 0.0, 0.05, seeds)
+    assert rounds == [40] and np.abs(by_motor).max() < 1e-17
+
+
+def test_rows_that_reverse_mode_gives_up(rounds, monkeypatch):
+    """They go through forward mode, all at once."""
+    scene, rng = Twins(), np.random.default_rng(0)
+    states, seeds = rng.uniform(-1.0, 1.0, (2, 9, 4))
+    states[2::3, 1] = 80.0  # these need many substeps
+    ways = np.concatenate(scene.jacobian(states, 0.3, 0.05), axis=-1)
+    forwards, jacobian = [], SeriesTangent.jacobian
+    spy = lambda self, states, *rest: forwards.append(len(states)) or jacobian(self, states, *rest)  # noqa: E731
+    monkeypatch.setattr(SeriesTangent, "jacobian", spy)
+    monkeypatch.setattr(driver, "LARGEST_COUNT", 1)
+    found = np.concatenate(scene.vjp(states, 0.3, 0.05, seeds), axis=-1)
+    assert rounds[0] == 9 and forwards == [3]
+    np.testing.assert_allclose(found, np.einsum("ni,nij->nj", seeds, ways), rtol=1e-12, atol=1e-12)
+
+
+def test_an_angle_that_no_formula_needs_may_be_large():
+    """That of a top about the vertical; refused is an angle of which sine and cosine are needed."""
+    far, seeds = 1e9, np.array([0.0, 1.0, 0.3, -0.2, 0.1, 0.5])
+    state = dict.fromkeys(Top().state_names, 0.4)
+    near, away = (Top().vjp([*(state | {"phi": phi}).values()], 0.1, 0.02, seeds)[0] for phi in (0.0, far))
+    np.testing.assert_array_equal(near, away)
+    for scene in (Top(), PivotedBar(), CartPole()):
+        state = np.where(np.array(scene.state_names) == "theta", far, 0.0)
+        with pytest.raises(StepRefused, match="theta"):
+            scene.vjp(state, 0.0, 0.02, np.ones(len(state)))
+
+
+@pytest.mark.parametrize("name", RATES)
+def test_slopes_of_functions_have_all_digits(name):
+    """Also where tanh is nearly 1."""
+    for x in (1e-9, 0.3, 3.0, 15.0, 25.0):
+        with mpmath.workdps(40):
+            exact = float(mpmath.sech(x) ** 2 if name == "tanh" else mpmath.diff(getattr(mpmath, name), x))
+        value = getattr(Numeric, name)(np.float64(x))
+        assert RATES[name](x, value, Numeric) == pytest.approx(exact, rel=1e-14, abs=0.0)
 
 
 # --- whole steps --------------------------------------------------------------------------------------------

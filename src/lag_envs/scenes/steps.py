@@ -182,8 +182,10 @@ def vjp(
             f"cotangent must have the shape of the state after the step, {(*shape, n)}, got {seeds.shape}"
         )
     if not np.isfinite(seeds).all():
-        raise ValueError(f"cotangent must be finite, got {seeds[~np.isfinite(seeds)][0]}")
-    check_turns(scene, states)
+        at = tuple(np.argwhere(~np.isfinite(seeds))[0].tolist())
+        raise ValueError(f"cotangent must be finite, got {seeds[at]} at {at}")
+    if form_of(scene):
+        check_turns(scene, states)
     found = pulled(scene, states, controls, check_step(dt), seeds.reshape(-1, n), by)
     found = found.reshape(*shape, n + m + len(by))
     parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
@@ -220,7 +222,7 @@ def pulled(
 def check_turns(scene: Scene, states: Array) -> None:
     """Raise StepRefused where a gradient needs sine and cosine of an angle that is too large for them.
 
-    Steps of scenes with a flow of their own go further than their gradients.
+    Steps of scenes with a flow of their own go further than their gradients. Other scenes refuse such steps.
     """
     for name, unit, column in zip(scene.state_names, scene.state_units, states.T, strict=True):
         if unit == "rad" and (far := np.abs(column) > LARGEST_ANGLE).any():

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from lag_envs.mechanics.evaluation import RATES
 from lag_envs.stepping.compiling import compile_lines, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import BOOLEAN, Operation, Trace, TracedNumber
@@ -99,20 +100,14 @@ class Differentiable(Trace):
             return [(a, seed * b), (b, seed * a)]
         if node.op in ("+", "-"):
             return [(a, seed), (b, seed if node.op == "+" else -seed)]
-        rule = {
-            "neg": lambda: -seed,
-            "abs": lambda: self.where(a < 0.0, -seed, seed),
-            "sqrt": lambda: 0.5 * (seed / node),
-            "exp": lambda: seed * node,
-            "log": lambda: seed / a,
-            "sin": lambda: seed * self.cos(a),
-            "cos": lambda: -(seed * self.sin(a)),
-            "atan": lambda: seed / (1.0 + a * a),
-            "tanh": lambda: seed * (1.0 - node * node),
-        }.get(str(node.op))
-        if rule is None:
+        if node.op == "neg":
+            return [(a, -seed)]
+        if node.op == "abs":
+            return [(a, self.where(a < 0.0, -seed, seed))]
+        rate = RATES.get(str(node.op))
+        if rate is None:
             raise TypeError(f"a formula calls {node.op!r}, of which there is no derivative")
-        return [(a, rule())]
+        return [(a, seed * rate(a, node, self))]
 
     @staticmethod
     def _branches(nodes: Sequence[TracedNumber]) -> set[str]:

@@ -167,14 +167,14 @@ class Backward(Series):
         def backwards() -> list:
             here = self._inputs_at(t, inputs, dt, after.left)
             start = self.expand(t, here, after.q, after.v, t.neg(length), order)
-            whole, rest = self._sweep(t, start, length, order, bars)
+            whole, rest, sizes = self._sweep(t, start, length, order, bars)
             found = [t.select(ended, new, old) for new, old in zip(whole, bars, strict=True)]
-            return [*found, self._largest_ratio(t, length, rest, whole, bars)]
+            return [*found, self._largest_ratio(t, length, rest, sizes, bars)]
 
         return after, t.when(back, backwards, [*bars, zero]), back
 
     def _largest_ratio(self, t: Target, h: Any, parts: Sequence, *wholes: Sequence) -> Any:
-        """Return the largest ratio of parts of cotangents to the cotangents before and after the step.
+        """Return the largest ratio of parts of cotangents to their sizes before and after the step.
 
         Those of a coordinate's place and velocity count together: each often passes through zero.
         """
@@ -194,10 +194,10 @@ class Backward(Series):
 
     def _sweep(
         self, t: Target, start: ExpansionStart, h: Any, order: Any, ends: Sequence
-    ) -> tuple[list, list]:
-        """Return the cotangents before the step just expanded at its end, and what they leave out.
+    ) -> tuple[list, list, list]:
+        """Return the cotangents before the step just expanded at its end, what they leave out, and sizes.
 
-        They come from those after it; what is left out is estimated as in `following`.
+        They come from those after it; what is left out is estimated as in `following`. See `_collect`.
         """
         first, n = t.index(0), self.size
         initial = [*ends[: 2 * n], *[t.number(0.0)] * len(self._active)]
@@ -325,8 +325,13 @@ class Backward(Series):
             assert op in FUNCTIONS
             order.add(bars, args[0], order.whole((n, 0), bar), -1.0 if op == "cos" else 1.0)
 
-    def _collect(self, t: Target, start: ExpansionStart, order: Any, ends: Sequence) -> tuple[list, list]:
-        """Return the sums of the series, small terms first, and what they leave out."""
+    def _collect(
+        self, t: Target, start: ExpansionStart, order: Any, ends: Sequence
+    ) -> tuple[list, list, list]:
+        """Return the sums of the series, small terms first, what they leave out, and their sizes.
+
+        The gradient by a source is a sum over weights, which may cancel: its size is that of the terms.
+        """
         first, per_order = following(t, order)
         count, zero = len(self._found), t.number(0.0)
 
@@ -340,17 +345,19 @@ class Backward(Series):
         _, *sums = t.loop(t.index(0), t.plus(order, 1), [first, *[zero] * (2 * count)], down)
         wholes, parts = sums[:count], sums[count:]
         moving = 2 * self.size
-        found, rest = wholes[:moving], parts[:moving]
+        found, rest, sizes = wholes[:moving], parts[:moving], wholes[:moving]
         for source, total in zip(self._sources, ends[moving:], strict=True):
-            part = zero
+            part = size = zero
             for name, bar, more in zip(self._active, wholes[moving:], parts[moving:], strict=True):
                 slope = self.record.tangents[name].get(source, 0.0)
                 if slope != 0.0:
                     slope = self.weight(t, start.scalars, slope)
-                    total, part = t.fma(bar, slope, total), t.fma(more, t.abs(slope), part)
+                    total, slope = t.fma(bar, slope, total), t.abs(slope)
+                    part, size = t.fma(more, slope, part), t.fma(t.abs(bar), slope, size)
             found.append(total)
             rest.append(part)
-        return found, rest
+            sizes.append(size)
+        return found, rest, sizes
 
 
 class _Order:

@@ -172,7 +172,8 @@ def _enough(length, dt, left_out, order):  # type: ignore[no-untyped-def]
 
     The certificate does not cover derivatives: at rest a series has no terms, while those of its derivatives
     may be large. `left_out` estimates what they leave out, relative to themselves, from their last terms. All
-    substeps of a step `dt` together may leave out `COMPLETE`, or each as much as it is rounded.
+    substeps of a step `dt` together may leave out `COMPLETE`, or each as much as it is rounded. NaN is no
+    reason for shorter ones: the caller refuses what is not finite.
     """
     if not (left_out > ROUNDED and left_out * dt > COMPLETE * length) or length < SHORT * dt:
         return np.inf
@@ -276,10 +277,11 @@ def _compile_lengths() -> tuple[Callable, Callable]:
 
 
 def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
-    """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
+    """Take control steps, then the same substeps backwards.
 
     No substep is longer than its lane's entry of `longest`. Where that was too long for the derivatives, a
-    smaller one takes its place, and what was found for the lane is of no use.
+    smaller one takes its place, or 0 if there were too many substeps. Then what was found for the lane is of
+    no use.
 
     Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
@@ -353,15 +355,17 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
                         kept[2 * n, end], kept[2 * n + 1, end] = remains, used
                         lanes[end] = whose[i]
                         end += 1
-                    if remains > 0.0:
-                        if table[wish, i] > 1.001 * longest[lane]:
-                            table[wish, i] = longest[lane]
-                        if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
-                            return first + whose[i] + 1
-                        for r in range(bounds + wanted):
-                            table[r, still] = table[r, i]
-                        whose[still] = whose[i]
-                        still += 1
+                    if remains == 0.0:
+                        continue
+                    if table[wish, i] > 1.001 * longest[lane]:
+                        table[wish, i] = longest[lane]
+                    if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
+                        longest[lane] = 0.0
+                        continue
+                    for r in range(bounds + wanted):
+                        table[r, still] = table[r, i]
+                    whose[still] = whose[i]
+                    still += 1
             for i in range(still, going):
                 table[left, i] = 0.0
             going = still
@@ -395,7 +399,6 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
             for c in range(wanted):
                 if pulled[c, r] != 0.0:
                     add(found[r, first:], pulled[c, r], bars[c], filled)
-    return 0
 
 
 def _fill(row, value, count):  # type: ignore[no-untyped-def]
@@ -416,7 +419,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
-    width = max(4, registers().doubles)  # even small series take many numbers on the way back
+    width = 8
     steep = any(node.op in STEEP for node in record.nodes)
     stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
     numbers = _numbers(record, TOLERANCE * stricter)

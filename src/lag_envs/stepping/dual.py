@@ -18,6 +18,7 @@ import numpy as np
 
 from lag_envs.mechanics.evaluation import RATES, Numeric
 from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.series import slope_of_tanh
 
 
 class DualNumber(NamedTuple):
@@ -140,7 +141,7 @@ class DualTarget:
             "exp": lambda: value,
             "log": lambda: t.div(one, x.value),
             "atan": lambda: t.div(one, t.fma(x.value, x.value, one)),
-            "tanh": lambda: t.sub(one, t.mul(value, value)),
+            "tanh": lambda: slope_of_tanh(t, x.value),
         }[name]()
         return DualNumber(value, self._times(x.slopes, rate))
 

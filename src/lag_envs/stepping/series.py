@@ -302,7 +302,7 @@ class Series:
         node = self.record.nodes[n]
         op, args = node.op, node.args
         if n in self._slopes_of_tanh:
-            return _slope_of_tanh(t, zero[self._slopes_of_tanh[n]])
+            return slope_of_tanh(t, zero[self._slopes_of_tanh[n]])
         if op == "place":
             return q[node.index]
         if op == "velocity":
@@ -619,7 +619,7 @@ class Series:
         return inputs | {ELAPSED: t.sub(dt, left)} if ELAPSED in self.record.inputs else inputs
 
 
-def _slope_of_tanh(t: Target, x: Any) -> Any:
+def slope_of_tanh(t: Target, x: Any) -> Any:
     """Return 1 - tanh², with all digits also where tanh is nearly 1.
 
     Computed literally, 1 - tanh² would have few digits or none, and so would all coefficients of tanh. Where

@@ -137,19 +137,17 @@ class SeriesTangent:
         while len(rows):  # all at first, then those whose substeps were too long for the derivatives
             before, parts = longest[some], [np.ascontiguousarray(x[:, some]) for x in (given, seeds, found)]
             shorter = before.copy()
-            if refused := self._pull(*parts, shorter, *linear, dt, order):
-                # In reverse mode no substep is longer than the shortest, so there may be too many. In forward
-                # mode substeps grow again.
-                i = rows[refused - 1 : refused]
-                slopes, refused = self.jacobian(states[i], controls[i], dt, order)
-                if refused:
-                    return None, int(i[0]) + 1
-                found[:, i] = np.einsum("ni,nij->jn", cotangents[i], slopes)
-                some = rows = np.setdiff1d(rows, i)
-                continue
-            too_long = shorter < before
+            self._pull(*parts, shorter, *linear, dt, order)
+            given_up, too_long = rows[shorter == 0.0], rows[(0.0 < shorter) & (shorter < before)]
             found[:, some], longest[some] = parts[-1], shorter
-            some = rows = rows[too_long]
+            # In reverse mode no substep is longer than the shortest, so there may be too many. In forward
+            # mode substeps grow again.
+            if len(given_up):
+                slopes, refused = self.jacobian(states[given_up], controls[given_up], dt, order)
+                if refused:
+                    return None, int(given_up[refused - 1]) + 1
+                found[:, given_up] = np.einsum("ni,nij->jn", cotangents[given_up], slopes)
+            some = rows = too_long
         return found.T, 0
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
