@@ -419,7 +419,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
-    width = 8
+    width = max(4, registers().doubles)  # even small series take many numbers on the way back
     steep = any(node.op in STEEP for node in record.nodes)
     stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
     numbers = _numbers(record, TOLERANCE * stricter)
