@@ -289,21 +289,11 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
     ``constants + starts @ given``. `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the
     cotangents of places, velocities and sources. `by_end` holds the derivatives of places and velocities with
     respect to the state, followed by `direct`.
-
-    Lanes are moved together as in `_unfinished`. The substep that ends a step usually goes backwards at
-    once. The ends of all others are stored, round by round, and go backwards afterwards, last round first,
-    again many lanes together.
     """
     wanted, count = len(pulled), given.shape[1]
     order = min(order + further, LARGEST_ORDER)
-    table, before = np.zeros((bounds + wanted + 1, BLOCK)), np.empty(BLOCK)
-    inputs, bars = np.empty((q, BLOCK)), np.empty((wanted, BLOCK))
+    table, bars = np.zeros((bounds + wanted + 1, BLOCK)), np.empty((wanted, BLOCK))
     again = np.zeros_like(table)
-    rows, rows_again = table.reshape(-1), again.reshape(-1)
-    # Columns of `kept` are substeps: places, velocities and the rest of the step after them, then their
-    # lengths. `lanes` holds the lane of each column, `rounds` the end of each round's columns.
-    kept, lanes = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64)
-    rounds, whose = np.empty(64, np.int64), np.empty(BLOCK, np.int64)
     for first in range(0, count, BLOCK):
         filled = min(BLOCK, count - first)
         for r in range(status):
@@ -311,86 +301,15 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
             for c in range(len(given)):
                 if starts[r, c] != 0.0:
                     add(table[r], starts[r, c], given[c, first:], filled)
-        for r in range(q):
-            put(inputs[r], table[r], BLOCK)
+        inputs = table[:q].copy()
         for r in range(wanted):
             fill(bars[r], 0.0, BLOCK)
             for c in range(len(cotangents) if r < 2 * n else 0):
                 if by_end[c, r] != 0.0:
                     add(bars[r], by_end[c, r], cotangents[c, first:], filled)
             put(table[bounds + r], bars[r], BLOCK)
-        fill(table[status], 0.0, BLOCK)
-        fill(table[left], 0.0, BLOCK)
-        fill(table[left], dt, filled)
-        for i in range(BLOCK):
-            whose[i] = i
-            table[wish, i] = dt if i >= filled or dt <= 1.001 * longest[first + i] else longest[first + i]
-        going, end, turns = filled, 0, 0
-        while going > 0:
-            if end + going > len(lanes):
-                kept = np.concatenate((kept, np.empty_like(kept)), axis=1)
-                lanes = np.concatenate((lanes, np.empty_like(lanes)))
-            if turns == len(rounds):
-                rounds = np.concatenate((rounds, np.empty_like(rounds)))
-            put(before, table[left], BLOCK)
-            still = 0
-            for begin in range(0, going, LANES):
-                back = pull(rows, begin, dt, order, tolerance) > 0
-                until = min(begin + LANES, going)
-                if back:
-                    for r in range(wanted):
-                        for i in range(begin, until):
-                            bars[r, whose[i]] = table[bounds + r, i]
-                for i in range(begin, until):
-                    remains = table[left, i]
-                    used = before[i] - remains
-                    lane = first + whose[i]
-                    if used > 0.0 and back and remains == 0.0:
-                        longest[lane] = min(
-                            longest[lane], enough_of(used, dt, table[bounds + wanted, i], order)
-                        )
-                    elif used > 0.0:
-                        for r in range(2 * n):
-                            kept[r, end] = table[q + r, i]
-                        kept[2 * n, end], kept[2 * n + 1, end] = remains, used
-                        lanes[end] = whose[i]
-                        end += 1
-                    if remains == 0.0:
-                        continue
-                    if table[wish, i] > 1.001 * longest[lane]:
-                        table[wish, i] = longest[lane]
-                    if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
-                        longest[lane] = 0.0
-                        continue
-                    for r in range(bounds + wanted):
-                        table[r, still] = table[r, i]
-                    whose[still] = whose[i]
-                    still += 1
-            for i in range(still, going):
-                table[left, i] = 0.0
-            going = still
-            rounds[turns] = end
-            turns += 1
-        for turn in range(turns - 1, -1, -1):
-            begin = rounds[turn - 1] if turn > 0 else 0
-            some = rounds[turn] - begin
-            for i in range(some):
-                lane = lanes[begin + i]
-                for r in range(q):
-                    again[r, i] = inputs[r, lane]
-                for r in range(2 * n):
-                    again[q + r, i] = kept[r, begin + i]
-                again[left, i], again[wish, i] = kept[2 * n, begin + i], kept[2 * n + 1, begin + i]
-                for r in range(wanted):
-                    again[bounds + r, i] = bars[r, lane]
-            for i in range(0, some, LANES):
-                pull(rows_again, i, dt, order, -1.0)
-            for i in range(some):
-                lane, used = first + lanes[begin + i], kept[2 * n + 1, begin + i]
-                longest[lane] = min(longest[lane], enough_of(used, dt, again[bounds + wanted, i], order))
-            for r in range(wanted):
-                for i in range(some):
-                    bars[r, lanes[begin + i]] = again[bounds + r, i]
+        ends, lanes, rounds = forwards(table, bars, longest[first:], filled, dt, order)
+        stored(again, inputs, bars, ends, lanes, rounds, longest[first:], dt, order)
         for r in range(len(found)):
             fill(found[r, first:], 0.0, filled)
             for c in range(len(cotangents)):
@@ -399,6 +318,91 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
             for c in range(wanted):
                 if pulled[c, r] != 0.0:
                     add(found[r, first:], pulled[c, r], bars[c], filled)
+
+
+def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untyped-def]
+    """Take a block's control steps; a substep that ends one usually goes backwards at once, in `bars`.
+
+    Lanes are moved together as in `_unfinished`. The ends of the other substeps are returned: columns of
+    places, velocities, what is left of the step, and the substep's length; then the lane of each, and the
+    number of them after each round.
+    """
+    fill(table[status], 0.0, BLOCK)
+    fill(table[left], 0.0, BLOCK)
+    fill(table[left], dt, going)
+    whose, before = np.arange(BLOCK), np.empty(BLOCK)
+    for i in range(BLOCK):
+        table[wish, i] = dt if i >= going or dt <= 1.001 * longest[i] else longest[i]
+    ends, lanes, rounds = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64), np.empty(64, np.int64)
+    end, turns = 0, 0
+    while going > 0:
+        if end + going > len(lanes):
+            ends = np.concatenate((ends, np.empty_like(ends)), axis=1)
+            lanes = np.concatenate((lanes, np.empty_like(lanes)))
+        if turns == len(rounds):
+            rounds = np.concatenate((rounds, np.empty_like(rounds)))
+        put(before, table[left], BLOCK)
+        still = 0
+        for begin in range(0, going, LANES):
+            back = pull(table.reshape(-1), begin, dt, order, tolerance) > 0
+            until = min(begin + LANES, going)
+            if back:
+                for r in range(len(bars)):
+                    for i in range(begin, until):
+                        bars[r, whose[i]] = table[bounds + r, i]
+            for i in range(begin, until):
+                lane, remains = whose[i], table[left, i]
+                used = before[i] - remains
+                if used > 0.0 and back and remains == 0.0:
+                    enough = enough_of(used, dt, table[bounds + len(bars), i], order)
+                    longest[lane] = min(longest[lane], enough)
+                elif used > 0.0:
+                    for r in range(2 * n):
+                        ends[r, end] = table[q + r, i]
+                    ends[2 * n, end], ends[2 * n + 1, end] = remains, used
+                    lanes[end] = lane
+                    end += 1
+                if remains == 0.0:
+                    continue
+                if table[wish, i] > 1.001 * longest[lane]:
+                    table[wish, i] = longest[lane]
+                if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
+                    longest[lane] = 0.0
+                    continue
+                for r in range(bounds + len(bars)):
+                    table[r, still] = table[r, i]
+                whose[still] = lane
+                still += 1
+        for i in range(still, going):
+            table[left, i] = 0.0
+        going = still
+        rounds[turns] = end
+        turns += 1
+    return ends, lanes, rounds[:turns]
+
+
+def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # type: ignore[no-untyped-def]
+    """Take the substeps that end at `ends` backwards, last round first, again many lanes together."""
+    for turn in range(len(rounds) - 1, -1, -1):
+        begin = rounds[turn - 1] if turn > 0 else 0
+        some = rounds[turn] - begin
+        for i in range(some):
+            lane = lanes[begin + i]
+            for r in range(q):
+                table[r, i] = inputs[r, lane]
+            for r in range(2 * n):
+                table[q + r, i] = ends[r, begin + i]
+            table[left, i], table[wish, i] = ends[2 * n, begin + i], ends[2 * n + 1, begin + i]
+            for r in range(len(bars)):
+                table[bounds + r, i] = bars[r, lane]
+        for i in range(0, some, LANES):
+            pull(table.reshape(-1), i, dt, order, -1.0)
+        for i in range(some):
+            lane, used = lanes[begin + i], ends[2 * n + 1, begin + i]
+            longest[lane] = min(longest[lane], enough_of(used, dt, table[bounds + len(bars), i], order))
+        for r in range(len(bars)):
+            for i in range(some):
+                bars[r, lanes[begin + i]] = table[bounds + r, i]
 
 
 def _fill(row, value, count):  # type: ignore[no-untyped-def]
@@ -424,6 +428,8 @@ def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable
     stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
     numbers = _numbers(record, TOLERANCE * stricter)
     numbers |= {"BLOCK": BLOCK, "LANES": width, "further": further, "LARGEST_ORDER": LARGEST_ORDER}
-    loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
-    helpers = compile_pull(record, sources, width), _compile_lengths()[0], *loops
-    return compile_python("pull_all", _pull_all, *helpers, **numbers)
+    pull, enough_of = compile_pull(record, sources, width), _compile_lengths()[0]
+    fill, put, add = (compile_python(f.__name__[1:], f, inner=True) for f in (_fill, _put, _add))
+    forwards = compile_python("forwards", _forwards, pull, enough_of, fill, put, inner=True, **numbers)
+    stored = compile_python("stored", _stored, pull, enough_of, inner=True, **numbers)
+    return compile_python("pull_all", _pull_all, forwards, stored, fill, put, add, **numbers)
