@@ -627,8 +627,8 @@ def test_parameters_of_sympys_expressions_are_numbers(number):
     [
         ({"coordinates": {"q": ["m"]}}, "Odd.coordinates: q must have a unit, got ['m']"),
         ({"applied": {"q": {}}}, "Odd.applied: q must have an expression, got {}"),
-        ({"controls": {dynamicsymbols("s").diff(): "m"}}, "is a derivative, which cannot be a name; write"),
-        ({"controls": {dynamicsymbols("s", 2): "m"}}, "which cannot be a name; write 's_ddot'"),
+        ({"controls": {dynamicsymbols("s").diff(): "m"}}, "a control that sets it is called 's_dot'"),
+        ({"controls": {dynamicsymbols("s", 2): "m"}}, "a control that sets it is called 's_ddot'"),
     ],
 )  # fmt: skip
 def test_units_and_names_of_sympys_expressions(given, message):

@@ -258,7 +258,9 @@ def _name(symbol: Any) -> str:
         return unicodedata.normalize("NFKC", symbol)
     if isinstance(symbol, sympy.Derivative) and isinstance(symbol.expr, AppliedUndef):
         rate = f"{symbol.expr.func.__name__}_{'d' * symbol.derivative_count}ot"
-        raise FormulaError(f"{symbol!r} is a derivative, which cannot be a name; write {rate!r}")
+        raise FormulaError(
+            f"{symbol!r} is a derivative, which cannot be a name; a control that sets it is called {rate!r}"
+        )
     raise FormulaError(f"{symbol!r} is neither a SymPy symbol nor a function of time; it cannot be a name")
 
 
