@@ -218,7 +218,11 @@ def test_rows_that_reverse_mode_gives_up(rounds, monkeypatch):
     states[2::3, 1] = 80.0  # these need many substeps
     ways = np.concatenate(scene.jacobian(states, 0.3, 0.05), axis=-1)
     forwards, jacobian = [], SeriesTangent.jacobian
-    spy = lambda self, states, *rest: forwards.append(len(states)) or jacobian(self, states, *rest)  # noqa: E731
+
+    def spy(self, states, *rest):
+        forwards.append(len(states))
+        return jacobian(self, states, *rest)
+
     monkeypatch.setattr(SeriesTangent, "jacobian", spy)
     monkeypatch.setattr(driver, "LARGEST_COUNT", 1)
     found = np.concatenate(scene.vjp(states, 0.3, 0.05, seeds), axis=-1)

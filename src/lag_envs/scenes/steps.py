@@ -222,7 +222,8 @@ def pulled(
 def check_turns(scene: Scene, states: Array) -> None:
     """Raise StepRefused where a gradient needs sine and cosine of an angle that is too large for them.
 
-    Steps of scenes with a flow of their own go further than their gradients. Other scenes refuse such steps.
+    Steps of scenes with a flow of their own go further than their gradients. The series refuses such steps
+    itself.
     """
     for name, unit, column in zip(scene.state_names, scene.state_units, states.T, strict=True):
         if unit == "rad" and (far := np.abs(column) > LARGEST_ANGLE).any():
