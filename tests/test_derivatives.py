@@ -13,6 +13,7 @@ from covering import covering, slow, way
 from test_jacobian import exact_step
 
 from lag_envs.envs.model import Model
+from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.mechanics.evaluation import RATES, Numeric
 from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
@@ -323,22 +324,52 @@ def test_whole_step(env_id):
         by_rewards=seeds[:, -1],
         parameters=names,
     )
+    target = np.zeros(0) if task.fixed_target is None else np.atleast_1d(task.fixed_target)
     for i in range(n):
-        slopes = np.concatenate([found.states[i], np.atleast_1d(found.actions[i]), found.parameters[i]])
-        direction = rng.uniform(-1.0, 1.0, len(slopes))
-        target = np.zeros(0) if task.fixed_target is None else np.atleast_1d(task.fixed_target)
-        target = np.atleast_1d(given["targets"][i]) if given else target
-        with mpmath.workdps(40):
-            h, ends = mpmath.mpf(10) ** -12, []
-            values = [*states[i], *actions[i], *(getattr(scene, name) for name in names)]
-            for side in (h, -h):
-                x = [mpmath.mpf(v) + side * mpmath.mpf(d) for v, d in zip(values, direction, strict=True)]
-                y, a = x[:width], x[width : width + actions.shape[1]]
-                p = dict(zip(names, x[width + len(a) :], strict=True))
-                results = exact_results(task, y, a, [mpmath.mpf(g) for g in target], p)
-                ends.append(sum(mpmath.mpf(s) * r for s, r in zip(seeds[i], results, strict=True)))
-            expected = float((ends[0] - ends[1]) / (2 * h))
-        assert abs(slopes @ direction - expected) <= 1e-10 * max(1.0, np.abs(slopes * direction).sum())
+        goal = np.atleast_1d(given["targets"][i]) if given else target
+        check_row(task, found, i, states[i], actions[i], goal, names, seeds[i], rng)
+
+
+def check_row(task, found, i, state, action, target, names, seeds, rng):
+    """Compare row i of gradients of a whole step along a random direction of all arguments."""
+    slopes = np.concatenate([found.states[i], np.atleast_1d(found.actions[i]), found.parameters[i]])
+    direction, width = rng.uniform(-1.0, 1.0, len(slopes)), len(state)
+    with mpmath.workdps(40):
+        h, ends = mpmath.mpf(10) ** -12, []
+        values = [*state, *action, *(getattr(task.scene, name) for name in names)]
+        for side in (h, -h):
+            x = [mpmath.mpf(v) + side * mpmath.mpf(d) for v, d in zip(values, direction, strict=True)]
+            y, a = x[:width], x[width : width + len(action)]
+            p = dict(zip(names, x[width + len(a) :], strict=True))
+            results = exact_results(task, y, a, [mpmath.mpf(g) for g in target], p)
+            ends.append(sum(mpmath.mpf(s) * r for s, r in zip(seeds, results, strict=True)))
+        expected = float((ends[0] - ends[1]) / (2 * h))
+    assert abs(slopes @ direction - expected) <= 1e-10 * max(1.0, np.abs(slopes * direction).sum())
+
+
+@pytest.mark.parametrize("with_parameters", [False, slow(True)])
+@pytest.mark.parametrize("env_id", [name for name in SMOOTH if TASKS[name]().formulas.has_last])
+def test_last_rewards(env_id, with_parameters):
+    """The last reward of an episode is differentiated where one ends, beside others that go on."""
+    envs, rng = LagrangianVectorEnv(TASKS[env_id], 64), seeded(env_id)
+    task, names = envs.task, finite(envs.task.scene) if with_parameters else ()
+    envs.reset(seed=0)
+    ended = np.zeros(64, bool)
+    while not ended.any():
+        states, actions = envs.state, rng.uniform(-1.0, 1.0, envs.action_space.shape).astype(np.float32)
+        _, _, ended, _, _ = envs.step(actions)
+    width = states.shape[1]
+    seeds = rng.uniform(-1.0, 1.0, (64, width + len(task.formulas.observation) + 1))
+    found = Model(task).vjp(
+        states,
+        actions[:, 0],
+        by_states=seeds[:, :width],
+        by_observations=seeds[:, width:-1],
+        by_rewards=seeds[:, -1],
+        parameters=names,
+    )
+    for i in (np.flatnonzero(ended)[0], np.flatnonzero(~ended)[0]):
+        check_row(task, found, i, states[i], actions[i].astype(float), (), names, seeds[i], rng)
 
 
 def test_what_is_clipped_has_no_gradient():

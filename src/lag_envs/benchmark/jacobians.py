@@ -144,7 +144,7 @@ def backwards(
     rounds, clock
         As for `jacobians`.
     ids : sequence of str
-        Environments; by default one for each scene.
+        Environments; by default all whose steps have derivatives.
     count : int
         How many of each there are in a batch.
 
@@ -155,8 +155,7 @@ def backwards(
         most 4.
     """
     smooth = [name for name, kind in TASKS.items() if not kind().formulas.choices and not kind.imperfections]
-    of_scenes = {TASKS[name].scene: name for name in reversed(smooth)}
-    return [_backwards(name, rounds, clock, count) for name in ids or of_scenes.values()]
+    return [_backwards(name, rounds, clock, count) for name in ids or smooth]
 
 
 def _backwards(name: str, rounds: int, clock: Callable[[], float], count: int) -> dict[str, Any]:

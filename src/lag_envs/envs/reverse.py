@@ -3,7 +3,8 @@
 A step is control, motion, reward and observation. Each part's derivatives are recorded from its formulas
 (`lag_envs.stepping.adjoint`). If the motion has a flow of its own, the whole step is one record. Otherwise,
 and for steps of the flow that are not ordinary, there are three parts: the formulas after the motion,
-`Scene.vjp`, and the formulas before it.
+`Scene.vjp`, and the formulas before it. Few steps end an episode, so a task's last reward, which may be a
+long formula, has a record of its own.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Reverse:
             found, others = [np.empty((size, count)).T for size in sizes], np.arange(count)
         else:
             *found, ordinary = self._whole(kicked)(self._numbers, *given)
-            (others,) = np.nonzero(ordinary[:, 0] == 0.0)
+            (others,) = np.nonzero(ordinary[:, 0] != 1.0)
         for first in range(0, len(others), ROWS):
             rows = others[first : first + ROWS]
             at: Any = slice(first, first + ROWS) if len(others) == count else rows
@@ -118,7 +119,13 @@ class Reverse:
     ) -> None:
         """Do the same as `pull`, into `out`, with the motion by itself; errors name the rows by `rows`."""
         (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
-        own_y, own_z, *own = self._after(kicked)(self._numbers, y, u, g, z, *rest)
+        *results, ended = self._after(kicked)(self._numbers, y, u, g, z, *rest)
+        (last,) = np.nonzero(ended[:, 0])
+        if len(last):
+            given = (x[last] for x in (y, u, g, z, *rest))
+            for x, some in zip(results, self._after(kicked, last=True)(self._numbers, *given), strict=False):
+                x[last] = some
+        own_y, own_z, *own = results
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
         before = self._lanes(
             "before", self._before_of, "y", "a", "g", "own_y", "own_u", "own_g", "own_p", "moved"
@@ -145,9 +152,9 @@ class Reverse:
         formula = partial(self._whole_of, kicked)
         return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
 
-    def _after(self, kicked: bool) -> LaneFormula:
-        name = "after_kicked" if kicked else "after"
-        formula = partial(self._after_of, kicked)
+    def _after(self, kicked: bool, last: bool = False) -> LaneFormula:
+        name = ("last" if last else "after") + ("_kicked" if kicked else "")
+        formula = partial(self._after_of, kicked, last)
         return self._lanes(name, formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")
 
     def _parameters_of(self, k: Any) -> list:
@@ -159,27 +166,47 @@ class Reverse:
             self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], lifted(self._form, y, xp), g, k)
         ]
 
-    def _reward_of(self, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> Any:
+    def _reward_of(self, last: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> tuple[Any, Any]:
+        """Return the reward of a step after which the episode goes on, and 1 if it does not, else 0.
+
+        With `last`, return that of a step after which it does not, and 0.
+        """
         given = lifted(self._form, y, xp), lifted(self._form, z, xp), u, g, k
+        if last:
+            return self._formulas.last(xp, *given), 0.0
         if not self._formulas.has_last:
-            return self._formulas.reward(xp, *given)
+            return self._formulas.reward(xp, *given), 0.0
         reward, ended = self._formulas.outcome(xp, *given)
-        return xp.where(ended, self._formulas.last(xp, *given), reward)
+        return reward, xp.where(ended, 1.0, 0.0)
 
     def _observe_of(self, xp: Any, k: Any, y: list, g: list) -> list[list]:
         return [self._formulas.observe(xp, lifted(self._form, y, xp), g, k)]
 
     def _after_of(
-        self, kicked: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list, e: list, **seeds: list
+        self,
+        kicked: bool,
+        last: bool,
+        xp: Any,
+        k: Any,
+        y: list,
+        u: list,
+        g: list,
+        z: list,
+        e: list,
+        **seeds: list,
     ) -> list[list]:
-        """Record the way back to the motion's end and past it: cotangents of y, z, u, g and parameters."""
+        """Record the way back to the motion's end and past it: cotangents of y, z, u, g and parameters.
+
+        The second result of `_reward_of` follows.
+        """
         e = e if kicked else z
-        outputs = [self._reward_of(xp, k, y, u, g, z), *self._observe_of(xp, k, e, g)[0], *e]
+        reward, ended = self._reward_of(last, xp, k, y, u, g, z)
+        outputs = [reward, *self._observe_of(xp, k, e, g)[0], *e]
         by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
         bars = [x for name in ("by_r", "by_o", "by_e") for x in seeds[name]]
         found = xp.adjoint(outputs, bars, [x for numbers in by for x in numbers])
         own_y, own_z, *rest, own_e = split_lengths(found, *map(len, by[:-1]))
-        return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
+        return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest, [ended]]
 
     def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, **found: list) -> list[list]:
         """Record the way back from the controls, and all sums: cotangents of y, a, g and parameters."""
@@ -192,14 +219,17 @@ class Reverse:
         return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
 
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
-        """Record the way back through the whole step: cotangents of y, a, g, no parameters; 1 if ordinary."""
+        """Record the way back through the whole step: cotangents of y, a, g, no parameters.
+
+        The last result is 1 where this holds: the step is ordinary, and the episode goes on.
+        """
         stepper: Any = code_of(self._task.scene, self._task.dt)
         (u,) = self._control_of(xp, k, y, a, g)
-        own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
+        own_y, own_z, own_u, own_g, _, (ended,) = self._after_of(kicked, False, xp, k, y=y, u=u, g=g, **rest)
         moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
         own = {"own_y": own_y, "own_u": own_u, "own_g": own_g, "own_p": []}
         by = self._before_of(xp, k, y, a, g, moved=moved, **own)
-        return [*by, [xp.where(ordinary, 1.0, 0.0)]]
+        return [*by, [xp.where(ordinary, 1.0, 0.0) - ended]]
 
 
 def kick_depends_on_state(task: Task) -> bool:

@@ -346,6 +346,11 @@ def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untype
         for begin in range(0, going, LANES):
             back = pull(table.reshape(-1), begin, dt, order, tolerance) > 0
             until = min(begin + LANES, going)
+            if back and turns == 0 and at_once(table[left], table[bounds + len(bars)], begin):
+                for r in range(len(bars)):
+                    for i in range(begin, until):
+                        bars[r, i] = table[bounds + r, i]
+                continue  # the usual case, without keeping the books
             if back:
                 for r in range(len(bars)):
                     for i in range(begin, until):
@@ -379,6 +384,14 @@ def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untype
         rounds[turns] = end
         turns += 1
     return ends, lanes, rounds[:turns]
+
+
+def _at_once(remains, left_out, begin):  # type: ignore[no-untyped-def]
+    """Return whether all these lanes took their step at once, with derivatives that leave out little."""
+    late = False
+    for i in range(begin, begin + LANES):
+        late |= (remains[i] > 0.0) | (left_out[i] > COMPLETE)
+    return not late
 
 
 def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # type: ignore[no-untyped-def]
@@ -430,6 +443,8 @@ def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable
     numbers |= {"BLOCK": BLOCK, "LANES": width, "further": further, "LARGEST_ORDER": LARGEST_ORDER}
     pull, enough_of = compile_pull(record, sources, width), _compile_lengths()[0]
     fill, put, add = (compile_python(f.__name__[1:], f, inner=True) for f in (_fill, _put, _add))
-    forwards = compile_python("forwards", _forwards, pull, enough_of, fill, put, inner=True, **numbers)
+    at_once = compile_python("at_once", _at_once, inner=True, COMPLETE=COMPLETE, LANES=width)
+    helpers = pull, enough_of, at_once, fill, put
+    forwards = compile_python("forwards", _forwards, *helpers, inner=True, **numbers)
     stored = compile_python("stored", _stored, pull, enough_of, inner=True, **numbers)
     return compile_python("pull_all", _pull_all, forwards, stored, fill, put, add, **numbers)
