@@ -491,15 +491,16 @@ class _EnvStep(torch.autograd.Function):
         envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.set_materialize_grads(False)
-        #: Environments that take a step, and those whose episode continues in the resulting state; None: all.
+        #: Environments that take no step, because their episode was over, and those where another one begins.
         ended = envs.ended
-        ctx.stepped = ctx.kept = None if ended is None else ~ended
+        ctx.waiting = ctx.begun = np.flatnonzero(() if ended is None else ended)
+        ctx.clock = envs.clock if envs.task.draws else None
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
         if (
             envs.autoreset_mode == AutoresetMode.SAME_STEP
             and (over := (terminated | truncated).numpy()).any()
         ):
-            ctx.kept = ~over
+            ctx.begun = np.flatnonzero(over)
         after = torch.from_numpy(envs.state)
         ctx.save_for_backward(state, actions, after)
         ctx.mark_non_differentiable(terminated, truncated)
@@ -508,7 +509,7 @@ class _EnvStep(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple:
-        model, stepped, kept = ctx.model, ctx.stepped, ctx.kept
+        model, waiting, begun = ctx.model, ctx.waiting, ctx.begun
         y, a, ends = (x.detach().numpy() for x in ctx.saved_tensors)
         task = model.task
         shapes = (len(y), len(task.formulas.observation)), (len(y),), y.shape
@@ -516,25 +517,33 @@ class _EnvStep(torch.autograd.Function):
             np.broadcast_to(0.0, shape) if seed is None else seed.detach().numpy()
             for seed, shape in zip(seeds, shapes, strict=False)
         )
-        if stepped is not None:  # restarted environments had no step
-            y, ends = (np.where(stepped[:, None], x, task.centre) for x in (y, ends))
-            a = np.where(stepped[:, None], a, np.float32(0.0))
+        y, ends = (_replaced(x, waiting, task.centre) for x in (y, ends))
+        a, by_observations, by_states = (
+            _replaced(x, rows, 0.0)
+            for x, rows in ((a, waiting), (by_observations, begun), (by_states, begun))
+        )
         after = ends
-        if kept is not None:
-            by_observations, by_states = (
-                np.where(kept[:, None], x, np.float32(0.0)) for x in (by_observations, by_states)
-            )
-        if task.draws or kept is not stepped:
+        if task.draws:
+            ends = after - model.kicks(*ctx.clock)
+        if begun is not waiting:  # there the end of the step is not known
             random = ctx.targets is not None and task.fixed_target is None
-            ends, _, _ = model(y, a[:, 0] if a.shape[1] == 1 else a, ctx.targets if random else None)
-            after = after if kept is None else np.where(kept[:, None], after, ends)
+            actions = a[begun, 0] if a.shape[1] == 1 else a[begun]
+            ends = _replaced(ends, begun, model(y[begun], actions, ctx.targets[begun] if random else None)[0])
+            after = after if task.draws else ends
         g = np.zeros((len(y), 0)) if ctx.targets is None else ctx.targets.reshape(len(y), -1)
         by_state, by_action, _, _ = model.reverse().pull(
             y, a, g, ends, after, by_states, by_observations, by_rewards
         )
-        if stepped is not None:
-            by_state[~stepped] = by_action[~stepped] = 0.0
+        by_state[waiting] = by_action[waiting] = 0.0
         return None, torch.from_numpy(by_state), torch.from_numpy(by_action).to(ctx.saved_tensors[1].dtype)
+
+
+def _replaced(x: NDArray[Any], rows: NDArray[np.intp], values: Any) -> NDArray[Any]:
+    """Return an array with other values in some rows, itself if there are none."""
+    if len(rows):
+        x = np.array(x)
+        x[rows] = values
+    return x
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:

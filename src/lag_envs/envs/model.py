@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.envs.lines import draw_lines, indented
 from lag_envs.envs.program import program_for
 from lag_envs.envs.reverse import Reverse
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.scenes.derivation import form_of
-from lag_envs.stepping.compiling import absent_from
+from lag_envs.stepping.compiling import absent_from, compile_lines
 from lag_envs.stepping.normal_forms import lifted
 from lag_envs.tasks.base import Task, check_task
 
@@ -338,6 +339,30 @@ class Model:
         numbers = _rows("draws", draws, (self.task.draws, len(array)), single=False)
         kicked = self.task.formulas.kick(np, list(numbers), rows, self._constants)
         return np.stack(np.broadcast_arrays(*kicked[: self._n_state]), axis=-1)
+
+    def kicks(self, episodes: NDArray[np.uint64], steps: NDArray[np.uint64]) -> Array:
+        """Return what random kicks add to the states, for a task whose kicks do not depend on the state.
+
+        Parameters
+        ----------
+        episodes : ndarray, shape (n,)
+            The keys of the episodes' random numbers.
+        steps : ndarray, shape (n,)
+            The numbers of the steps, from 1.
+
+        Returns
+        -------
+        ndarray, shape (n, n_state)
+        """
+        draws = np.empty((self.task.draws, len(episodes)))
+        lines = ["key = episodes[i]", *draw_lines([f"draws[{j}, i]" for j in range(len(draws))], "steps[i]")]
+        body = indented("for i in range(draws.shape[1]):", lines)
+        compile_lines("draw_all", "draws, episodes, steps", body)(draws, episodes, steps)
+        formulas, found = self.task.formulas, np.zeros((len(episodes), self._n_state))
+        still = lifted(form_of(self.task.scene), np.zeros(self._n_state), np)
+        for name, values in formulas.added(np, list(draws), still, self._constants).items():
+            found[:, formulas.state.index(name)] = values
+        return found
 
     def _targets(self, targets: ArrayLike | None, n: int) -> Array:
         """Return targets of shape (n, n_targets)."""

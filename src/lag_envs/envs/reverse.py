@@ -22,7 +22,7 @@ from lag_envs.scenes.steps import check_turns, pulled
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.normal_forms import lifted
-from lag_envs.stepping.tracing import TracedNumber, clip
+from lag_envs.stepping.tracing import Trace, clip
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -233,18 +233,15 @@ class Reverse:
 
 
 def kick_depends_on_state(task: Task) -> bool:
-    """Return whether the change by a task's random kick has a derivative with respect to the state."""
-    formulas, xp = task.formulas, Differentiable()
+    """Return whether what a task's random kick adds to the state depends on the state."""
+    formulas, xp = task.formulas, Trace()
     z = xp.inputs(*(f"z{i}" for i in range(len(formulas.state))))
     draws = xp.inputs(*(f"draw{i}" for i in range(task.draws)))
     k = SimpleNamespace(**formulas.constants())
-    after = formulas.kick(xp, draws, lifted(form_of(task.scene), z, xp), k)
-    slopes = [xp.adjoint([end], [1.0], z) for end in after[: len(z)]]
-    return any(
-        isinstance(slope, TracedNumber) or slope != float(i == j)
-        for i, row in enumerate(slopes)
-        for j, slope in enumerate(row)
-    )
+    added = formulas.added(xp, draws, lifted(form_of(task.scene), z, xp), k)
+    operations, results = xp.operations(added.values())
+    used = {*results, *(arg for operation in operations for arg in operation.args)}
+    return any(x.name in used for x in z)
 
 
 def _sums(*lists: list) -> list:

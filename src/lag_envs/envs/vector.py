@@ -511,6 +511,11 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         return self._turn, self._starts
 
     @property
+    def clock(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """Keys of the episodes' random numbers, and the numbers of the next steps; for `Model.kicks`."""
+        return self._keys[2].copy(), np.maximum(self._read("n") + 1.0, 0.0).astype(np.uint64)
+
+    @property
     def limits(self) -> NDArray[np.float64]:
         """Steps of an episode in each environment; infinity for one without an end."""
         return np.array([constants["limit"] for constants in self._constants])

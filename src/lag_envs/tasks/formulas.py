@@ -390,17 +390,22 @@ class TaskFormulas:
             self._refuse(name, value, "a number")
         return k.scale * value if self._task.scaled else _counted(value)
 
-    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
-        """Return the state after a kick."""
+    def added(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> dict[str, Any]:
+        """Return what a kick adds to entries of the state, by name."""
         drawn = Values("random draw", {str(i): draw for i, draw in enumerate(draws)})
         added = self._call("kick", k, self.named_state(z, k), drawn, self._known(xp, z))
         if not isinstance(added, Mapping):
             self._refuse("kick", added, "changes of the state's entries by name")
         self._check_names("kick", "entry {!r} of the state", added, self.state)
-        after = dict(zip(self.state, z, strict=False))
-        for name, value in added.items():
+        for value in added.values():
             if isinstance(value, Values):
                 self._refuse("kick", value, "numbers")
+        return dict(added)
+
+    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
+        """Return the state after a kick."""
+        after, added = dict(zip(self.state, z, strict=False)), self.added(xp, draws, z, k)
+        for name, value in added.items():
             after[name] = after[name] + value
         angle = None if self._form is None else self._form.angle
         if angle is None or self.state[angle] not in added:
