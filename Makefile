@@ -6,6 +6,8 @@
 PYTHON ?=
 ARGS ?=
 BIN := .venv/bin
+# Where this is set, each of the many processes that tests start would compile all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 # The oldest supported Gymnasium, Numba and NumPy, and the tests that are run on them too.
 OLDEST_GYMNASIUM := 1.2.2

@@ -118,14 +118,13 @@ class Reverse:
         self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> None:
         """Do the same as `pull`, into `out`, with the motion by itself; errors name the rows by `rows`."""
-        (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
-        *results, ended = self._after(kicked)(self._numbers, y, u, g, z, *rest)
-        (last,) = np.nonzero(ended[:, 0])
+        results = self._after(kicked)(self._numbers, y, a, g, z, *rest)
+        (last,) = np.nonzero(results[-1][:, 0])
         if len(last):
-            given = (x[last] for x in (y, u, g, z, *rest))
-            for x, some in zip(results, self._after(kicked, last=True)(self._numbers, *given), strict=False):
+            given = (x[last] for x in (y, a, g, z, *rest))
+            for x, some in zip(results, self._after(kicked, last=True)(self._numbers, *given), strict=True):
                 x[last] = some
-        own_y, own_z, *own = results
+        u, own_y, own_z, *own, _ = results
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
         before = self._lanes(
             "before", self._before_of, "y", "a", "g", "own_y", "own_u", "own_g", "own_p", "moved"
@@ -155,16 +154,16 @@ class Reverse:
     def _after(self, kicked: bool, last: bool = False) -> LaneFormula:
         name = ("last" if last else "after") + ("_kicked" if kicked else "")
         formula = partial(self._after_of, kicked, last)
-        return self._lanes(name, formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")
+        return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
 
     def _parameters_of(self, k: Any) -> list:
         return [getattr(k, f"self_{name}") for name in self._parameters]
 
-    def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list[list]:
+    def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list:
         top = self._formulas.largest
-        return [
-            self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], lifted(self._form, y, xp), g, k)
-        ]
+        return self._formulas.control(
+            xp, [clip(x, -top, top, xp) for x in a], lifted(self._form, y, xp), g, k
+        )
 
     def _reward_of(self, last: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> tuple[Any, Any]:
         """Return the reward of a step after which the episode goes on, and 1 if it does not, else 0.
@@ -189,31 +188,31 @@ class Reverse:
         xp: Any,
         k: Any,
         y: list,
-        u: list,
+        a: list,
         g: list,
         z: list,
         e: list,
         **seeds: list,
     ) -> list[list]:
-        """Record the way back to the motion's end and past it: cotangents of y, z, u, g and parameters.
+        """Record the controls, and the way back to the motion's end and past it.
 
-        The second result of `_reward_of` follows.
+        The results are u, the cotangents of y, z, u, g and parameters, and the second result of `_reward_of`.
         """
-        e = e if kicked else z
+        u, e = self._control_of(xp, k, y, a, g), e if kicked else z
         reward, ended = self._reward_of(last, xp, k, y, u, g, z)
         outputs = [reward, *self._observe_of(xp, k, e, g)[0], *e]
         by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
         bars = [x for name in ("by_r", "by_o", "by_e") for x in seeds[name]]
         found = xp.adjoint(outputs, bars, [x for numbers in by for x in numbers])
         own_y, own_z, *rest, own_e = split_lengths(found, *map(len, by[:-1]))
-        return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest, [ended]]
+        return [u, own_y, _sums(own_z, own_e) if kicked else own_z, *rest, [ended]]
 
     def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, **found: list) -> list[list]:
         """Record the way back from the controls, and all sums: cotangents of y, a, g and parameters."""
         by_y, by_u, by_p = split_lengths(found["moved"], len(y), len(found["own_u"]))
         by = [y, a, g, self._parameters_of(k)]
         bars = _sums(found["own_u"], by_u)
-        own = xp.adjoint(self._control_of(xp, k, y, a, g)[0], bars, [x for numbers in by for x in numbers])
+        own = xp.adjoint(self._control_of(xp, k, y, a, g), bars, [x for numbers in by for x in numbers])
         last_y, last_a, last_g, last_p = split_lengths(own, *map(len, by[:-1]))
         by_y, by_p = _sums(found["own_y"], by_y, last_y), _sums(found["own_p"], by_p, last_p)
         return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
@@ -224,8 +223,8 @@ class Reverse:
         The last result is 1 where this holds: the step is ordinary, and the episode goes on.
         """
         stepper: Any = code_of(self._task.scene, self._task.dt)
-        (u,) = self._control_of(xp, k, y, a, g)
-        own_y, own_z, own_u, own_g, _, (ended,) = self._after_of(kicked, False, xp, k, y=y, u=u, g=g, **rest)
+        after = self._after_of(kicked, False, xp, k, y=y, a=a, g=g, **rest)
+        u, own_y, own_z, own_u, own_g, _, (ended,) = after
         moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
         own = {"own_y": own_y, "own_u": own_u, "own_g": own_g, "own_p": []}
         by = self._before_of(xp, k, y, a, g, moved=moved, **own)
