@@ -119,7 +119,7 @@ class Reverse:
     ) -> None:
         """Do the same as `pull`, into `out`, with the motion by itself; errors name the rows by `rows`."""
         results = self._after(kicked)(self._numbers, y, a, g, z, *rest)
-        (last,) = np.nonzero(results[-1][:, 0])
+        last = np.flatnonzero(results[-1][:, 0] != 0.0)
         if len(last):
             given = (x[last] for x in (y, a, g, z, *rest))
             for x, some in zip(results, self._after(kicked, last=True)(self._numbers, *given), strict=True):
