@@ -138,12 +138,9 @@ def test_gradient_of_an_episode(env_id):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_kicks_come_from_the_environments_random_numbers(mode, env_id):
     """The gradient of each step is that at the end before the kick, also where episodes end and begin."""
-    envs, rng = (
-        TorchVectorEnv(env_id, 32, autoreset_mode=mode, max_episode_steps=20),
-        np.random.default_rng(0),
-    )
+    envs = TorchVectorEnv(env_id, 32, autoreset_mode=mode, max_episode_steps=20)
     envs.reset(seed=0)
-    model, made = envs.model, envs.envs
+    model, made, rng = envs.model, envs.envs, np.random.default_rng(0)
     for _ in range(50):
         ended, clock, states = made.ended, made.clock, envs.state.numpy()
         actions = torch.tensor(rng.uniform(-1.0, 1.0, envs.action_space.shape)).requires_grad_()
@@ -152,12 +149,11 @@ def test_kicks_come_from_the_environments_random_numbers(mode, env_id):
         envs.detach()
         went_on = ~(over[0] | over[1]).numpy() if mode == "SameStep" else np.ones(32, bool)
         stepped = np.ones(32, bool) if ended is None else ~ended
-        ends = model(states, actions.detach().numpy()[:, 0], *([] if made.target is None else [made.target]))[
-            0
-        ]
+        given = states, actions.detach().numpy()[:, 0]
+        ends, _, _ = model(*given)
         kicked = (ends + model.kicks(*clock))[stepped & went_on]
         np.testing.assert_allclose(made.state[stepped & went_on], kicked, rtol=1e-12, atol=1e-12)
-        expected = model.vjp(states, actions.detach().numpy()[:, 0], ends=ends, by_rewards=1.0).actions
+        expected = model.vjp(*given, ends=ends, by_rewards=1.0).actions
         np.testing.assert_allclose(slope[stepped, 0].numpy(), expected[stepped], rtol=1e-9, atol=1e-9)
 
 

@@ -491,7 +491,7 @@ class _EnvStep(torch.autograd.Function):
         envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.set_materialize_grads(False)
-        #: Environments that take no step, because their episode was over, and those where another one begins.
+        #: Environments whose episode was over, which take no step; and those in which another one has begun.
         ended = envs.ended
         ctx.waiting = ctx.begun = np.flatnonzero(() if ended is None else ended)
         ctx.clock = envs.clock if envs.task.draws else None

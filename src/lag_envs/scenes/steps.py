@@ -226,10 +226,9 @@ def check_turns(scene: Scene, states: Array) -> None:
     itself.
     """
     for name, unit, column in zip(scene.state_names, scene.state_units, states.T, strict=True):
-        if unit != "rad" or column @ column <= LARGEST_ANGLE**2:  # a quick test that nearly all pass
-            continue
-        if (far := np.abs(column) > LARGEST_ANGLE).any():
-            i = int(np.argmax(far))
+        # The sum of squares is found quickly, and is nearly always small enough.
+        if unit == "rad" and column @ column > LARGEST_ANGLE**2 and np.abs(column).max() > LARGEST_ANGLE:
+            i = int(np.argmax(np.abs(column) > LARGEST_ANGLE))
             raise StepRefused(
                 f"the gradient of row {i} needs sine and cosine of "
                 f"{name}={column[i]:.9g}, which are not computed beyond {LARGEST_ANGLE:g} rad; "

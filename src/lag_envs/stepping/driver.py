@@ -350,7 +350,7 @@ def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untype
                 for r in range(len(bars)):
                     for i in range(begin, until):
                         bars[r, i] = table[bounds + r, i]
-                continue  # the usual case, without keeping the books
+                continue  # the usual case needs no bookkeeping
             if back:
                 for r in range(len(bars)):
                     for i in range(begin, until):
