@@ -61,6 +61,8 @@ def frames(page, ghost=False, to_the_end=False):
     page.wait_for_timeout(2000 if to_the_end else 500)  # the first frames also compile
     page.context.browser.start_tracing(page=page, categories=["devtools.timeline"])
     for i in range(8):
+        if page.text_content(".go") == "Start again" and not to_the_end:
+            page.keyboard.press("r")  # short episodes have too few frames
         key = ("ArrowLeft", "ArrowRight")[i % 2]
         page.keyboard.down(key)
         page.wait_for_timeout(400)

@@ -329,15 +329,18 @@ function reader({ zero, inverse, states, width, pairs }) {
   };
 }
 
-/** A layer without its activation, into an array of its own. */
+/** A layer without its activation, into an array of its own: column by column, as many inputs may be 0. */
 function affine(weight, bias) {
-  const [factors, starts] = [weight.n, bias.n];
-  const out = new Float64Array(starts.length);
+  const [rows, wide] = weight.shape;
+  const columns = new Float64Array(rows * wide);
+  weight.n.forEach((x, at) => (columns[(at % wide) * rows + Math.floor(at / wide)] = x));
+  const out = new Float64Array(rows);
   return (x) => {
-    for (let row = 0, at = 0; row < out.length; row++) {
-      let sum = starts[row];
-      for (let i = 0; i < x.length; i++) sum += x[i] * factors[at++];
-      out[row] = sum;
+    out.set(bias.n);
+    for (let i = 0; i < wide; i++) {
+      const factor = x[i];
+      if (factor === 0) continue;
+      for (let row = 0, at = i * rows; row < rows; row++, at++) out[row] += factor * columns[at];
     }
     return out;
   };
