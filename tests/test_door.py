@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import math
 import random
 import re
@@ -99,6 +100,26 @@ UNTRACEABLE = {
     "is in": (
         {"potential": lambda self, q, xp: q.x**2 if self.spring in (0.0, 1.0) else 0.0},
         "potential; comparison",
+    ),
+    "table": (
+        {"potential": lambda self, q, xp: {1.0: 2.0}.get(self.mass, 1.0) * q.x**2},
+        "potential; a look-up in a table; look up a field that is no parameter",
+    ),
+    "cache": (
+        {"potential": functools.cache(lambda self, q, xp: self.mass * q.x**2)},
+        "potential; cache; drop a cache",
+    ),
+    "type": (
+        {"potential": lambda self, q, xp: q.x**2 if isinstance(self.mass, float) else 0.0},
+        "potential; another result on plain numbers; the type or the text",
+    ),
+    "text of a parameter": (
+        {"applied": lambda self, q, v, u, xp: {"x": u.force if str(self.mass) == "1.0" else 2.0 * u.force}},
+        "applied; another result on plain numbers",
+    ),
+    "recursion": (
+        {"potential": lambda self, q, xp: self.potential(q, xp)},
+        "potential; RecursionError; calls itself without end",
     ),
     "is among the coordinates": (
         {"potential": lambda self, q, xp: q.x**2 if self.spring in q else 0.0},
@@ -699,6 +720,15 @@ def test_unknown_parameter():
 def test_bad_state_or_control(call, state, control, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         getattr(Good(), call)(state, control)
+
+
+def test_an_energy_that_divides_by_zero():
+    """The motion does not: what is constant drops out."""
+    scene = changed(potential=lambda self, q, xp: self.spring * q.x**2 + 1.0 / (self.mass - 2.0))(mass=2.0)
+    rest = [0.1] * len(scene.state_names)
+    assert math.isfinite(scene.acceleration(rest)["x"])
+    with pytest.raises(ValueError, match=r"the energy is undefined with these parameters, .*mass=2.0"):
+        scene.energy(rest)
 
 
 @pytest.mark.parametrize("gap", [1e-6, 1e-9, 1e-12])

@@ -330,3 +330,47 @@ def test_what_needs_short_substeps_once_is_not_paid_for_ever():
     pulled, _ = scene.vjp(states, no_control, 0.1, seeds)
     wanted = np.einsum("ni,nij->nj", seeds, found)
     np.testing.assert_allclose(pulled, wanted, rtol=0.0, atol=1e-12 * np.abs(wanted).max())
+
+
+class Neighbours(Scene):
+    """Two pendulums on one pivot, whose bobs repel each other at a short distance."""
+
+    coordinates = {"a": "rad", "b": "rad"}
+    repulsion: float = parameter(1e-9, "N m2")
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.a**2 + v.b**2)
+
+    def distance(self, q, xp):
+        x, y = xp.sin(q.a) - xp.sin(q.b), xp.cos(q.b) - xp.cos(q.a)
+        return xp.sqrt(x**2 + y**2)
+
+    def potential(self, q, xp):
+        return self.repulsion / self.distance(q, xp) - 9.81 * (xp.cos(q.a) + xp.cos(q.b))
+
+
+class HalfAngles(Neighbours):
+    def distance(self, q, xp):
+        return 2.0 * xp.sin((q.b - q.a) / 2.0)
+
+
+def test_the_distance_of_close_points_keeps_its_digits():
+    """Its square, multiplied out, is 2 - 2 cos(a - b)."""
+    state = [0.3, 0.1, 0.3 + 1e-5, 0.1]
+    with mpmath.workdps(40):
+        gap = mpmath.mpf(state[2]) - mpmath.mpf(state[0])
+        push = mpmath.mpf(1e-9) * mpmath.cos(gap / 2) / (4 * mpmath.sin(gap / 2) ** 2)
+        wanted = float(-push - mpmath.mpf(9.81) * mpmath.sin(mpmath.mpf(state[0])))
+    for scene in (Neighbours(), HalfAngles()):
+        assert scene.acceleration(state)["a"] == pytest.approx(wanted, rel=1e-10)
+
+
+@pytest.mark.slow
+def test_so_do_the_step_and_its_derivatives():
+    state = [0.3, 0.1, 0.3 + 1e-4, 0.1]
+    one, other = Neighbours(), HalfAngles()
+    assert one.step_bound(state, [], 0.02).substeps <= other.step_bound(state, [], 0.02).substeps + 2
+    after = other.simulate(state, 1, 0.02)[-1]
+    np.testing.assert_allclose(one.simulate(state, 1, 0.02)[-1], after, rtol=0.0, atol=1e-13)
+    found, wanted = (scene.jacobian(state, [], 0.02)[0] for scene in (one, other))
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-11 * np.abs(wanted).max())

@@ -14,6 +14,7 @@ from lag_envs.mechanics.algebra import (
     Atom,
     Expr,
     RecordedFunctions,
+    apart,
     derivative,
     evaluate,
     function_of,
@@ -159,6 +160,28 @@ def test_sums_that_may_meet_others_are_multiplied_out():
     for a, b in ((1 + c, 2 + c), (1 + v, 2 + v), (1 + v, d), (1 + c, d), (1 + K, d), (1 + K, 2 + K)):
         assert len((a * b).terms) > 2 and (a * b).same(b * a)
     assert apply_identities((1 + c) * (1 - c) - 1).same(-c * c)
+
+
+def test_sums_with_cosines_stay_factors_apart():
+    """So a potential keeps its digits where they are small."""
+    with apart():
+        w = function_of("cos", X) - C
+        power = w**6
+        assert (w * w * w * w * w * w).same(power) and ((w * w) ** 3).same(power) and len(power.terms) == 1
+        square = (function_of("sin", X) - function_of("sin", Y)) ** 2
+        assert len(square.terms) == 1 and len((square + w**2).terms) == 2
+        many = math.prod(function_of("sin", i * X) + function_of("cos", Y + i) + C for i in range(1, 9))
+        assert len(many.terms) == 1
+    assert len((w * w).terms) == 3
+    shift = {PLACES[0]: X + 1}  # puts in a place, and takes nothing apart
+    assert len(substitute(square, shift).terms) == 1
+    assert len(substitute(square, {place: Expr.of(1) for place in PLACES}).terms) == 0
+
+
+def test_roots_of_fourth_powers_are_squares():
+    assert function_of("sqrt", X**4).same(X**2)
+    assert function_of("sqrt", 9 * X**8 * C).same(X**4 * function_of("sqrt", 9 * C))
+    assert function_of("sqrt", C / X**4).same(function_of("sqrt", C) / X**2)
 
 
 # --- records ------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ coefficients, so that equal terms are merged and terms that cancel leave nothing
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
 an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers and
 products of sums that change with the motion are not expanded, except squares and products whose terms may
-combine with others. Besides the rules of sums and products there is one more: √x² = x. Those of sine and
-cosine are applied on request (`lag_envs.mechanics.identities`).
+combine with others (see `apart`). Besides the rules of sums and products there is one more: √x² = x. Those
+of sine and cosine are applied on request (`lag_envs.mechanics.identities`).
 
 Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
 same bits in every process.
@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from fractions import Fraction
 from functools import partial
 from typing import Any, ClassVar, NoReturn
@@ -27,6 +29,23 @@ Monomial = tuple[tuple["Atom", int], ...]
 LARGEST_PRODUCT = 4096
 #: The remedy for a branch on a number.
 BRANCH = "where the form differs, branch on a field that is no parameter, such as `spring: bool = True`"
+
+
+_apart: ContextVar[bool] = ContextVar("apart", default=False)
+
+
+@contextmanager
+def apart(wanted: bool = True) -> Iterator[None]:
+    """Keep squares and products of sums with sines and cosines as they are, within this context.
+
+    In a kinetic energy they are expanded, as cos² + sin² = 1 shortens it. In a potential, the square of the
+    distance of two points that are close together would become a small difference of large numbers.
+    """
+    token = _apart.set(wanted)
+    try:
+        yield
+    finally:
+        _apart.reset(token)
 
 
 class FormulaError(TypeError, ValueError):
@@ -132,9 +151,6 @@ class Expr:
 
     def __repr__(self) -> str:
         return f"Expr({self.text})"
-
-    def __hash__(self) -> int:
-        return hash(self.text)
 
     def same(self, other: Expr) -> bool:
         """Return whether two expressions have the same terms."""
@@ -254,17 +270,23 @@ class Expr:
     def _stays(self, exponent: int) -> bool:
         """Return whether this power of the sum is not expanded.
 
-        A square is expanded if terms of it may meet others: in a kinetic energy, and by cos² + sin² = 1.
+        A square is expanded if terms of it may meet others: velocities, and by cos² + sin² = 1, see `apart`.
         """
         if len(self.terms) < 2:
             return False
         moving = [a for a in self.atoms() if any(s.kind != "parameter" for s in Expr.of(a).symbols())]
         if exponent > 2:
             return bool(moving)
-        meets = ("sin", "cos")
+        meets = () if _apart.get() else ("sin", "cos")
         return bool(moving) and not any(
             a.function in meets or s.kind == "velocity" for a in moving for s in Expr.of(a).symbols()
         )
+
+    def _is_apart(self) -> bool:
+        """Return whether only `apart` keeps the sum from being expanded."""
+        with apart():
+            stays = self._is_factor()
+        return stays and not self._is_factor()
 
     def _is_factor(self) -> bool:
         """Return whether the sum stays apart in a product with another such sum."""
@@ -313,6 +335,10 @@ class Expr:
         self._refuse("a comparison, min or max", remedy)
 
     __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
+
+    def __hash__(self) -> int:
+        remedy = "drop a cache; look up a field that is no parameter, such as `gear: int = 2`"
+        self._refuse("a look-up in a table, set or cache", remedy)
 
     def __abs__(self) -> Expr:
         self._refuse("abs()", "an energy must be smooth: xp.sqrt(x * x + eps * eps) rounds the corner")
@@ -382,8 +408,8 @@ def _kept_product(first: Expr, second: Expr) -> Expr | None:
     """Return a product in which sums stay factors, or None if it is expanded.
 
     (x - c - 1)(x - c + 1)(x - c - 2) expanded would be a small difference of large numbers, as a power would.
-    Sums with velocities, sines or cosines are expanded (see `Expr._stays`), unless the other operand already
-    contains a power of the same sum.
+    Sums with velocities, and usually with sines or cosines, are expanded (see `Expr._stays`), unless the
+    other operand already contains a power of the same sum.
     """
     if len(first.terms) < len(second.terms):
         first, second = second, first
@@ -456,6 +482,12 @@ def function_of(name: str, argument: Any) -> Expr:
     argument = Expr.of(argument)
     if name == "sqrt":
         _check_root(argument)
+        if len(argument.terms) == 1:  # √(x⁴ y) = x² √y has all derivatives where x is 0
+            ((monomial, c),) = argument.terms.items()
+            even = tuple((a, n // 2) for a, n in monomial if n % 4 == 0)
+            if even:
+                rest = Expr({tuple((a, n) for a, n in monomial if n % 4): c})
+                return Expr({even: 1}) * function_of("sqrt", rest)
     number = argument.number
     if number is not None:
         try:
@@ -595,7 +627,10 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
                 factor = Expr.of(atom)
             else:
                 inner = substitute(atom.argument, values)
-                factor = inner if atom.function == "sum" else function_of(atom.function, inner)
+                if atom.function != "sum":
+                    factor = function_of(atom.function, inner)
+                else:  # it stays apart
+                    factor = _as_factor(inner) if inner._is_apart() else inner
             product = product * factor**n
         total = total + product
     return total

@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from lag_envs.errors import hint
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, apart, substitute
 from lag_envs.mechanics.equations import Energies, place, velocity
 from lag_envs.mechanics.layout import SceneLayout
 
@@ -164,12 +164,21 @@ class Record:
     rests: Mapping[str, Expr]
     poses: Mapping[str, tuple[Expr, Expr, Expr]]
 
+    def by_formula(self) -> dict[str, list[Expr]]:
+        """Return the expressions of each formula, in a fixed order."""
+        e = self.energies
+        return {
+            "kinetic": [e.kinetic],
+            "potential": [e.potential],
+            "dissipation": [e.dissipation],
+            "applied": [e.applied[name] for name in sorted(e.applied)],
+            "rests": [self.rests[name] for name in sorted(self.rests)],
+            "poses": [x for name in sorted(self.poses) for x in self.poses[name]],
+        }
+
     def exprs(self) -> list[Expr]:
         """Return all expressions, in a fixed order."""
-        e = self.energies
-        parts = [e.kinetic, e.potential, e.dissipation, *(e.applied[name] for name in sorted(e.applied))]
-        parts += [self.rests[name] for name in sorted(self.rests)]
-        return parts + [x for name in sorted(self.poses) for x in self.poses[name]]
+        return [x for found in self.by_formula().values() for x in found]
 
 
 @contextlib.contextmanager
@@ -203,6 +212,8 @@ def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
     """Return what to do about an error in a formula of a scene or task, or what it was computed from."""
     if of_numpy := re.search(r"no callable (\w+) method", str(error)):  # np.exp of a recorded number
         return f"write xp.{of_numpy[1]}, and functions of xp only"
+    if isinstance(error, RecursionError):
+        return "a formula calls itself without end"
     owner = getattr(error, "obj", None)
     ours = owner is not None and type(owner) in (type(of), type(getattr(of, "scene", None)))
     if not isinstance(error, AttributeError) or not ours:
@@ -284,9 +295,9 @@ def record_scene(scene: Any, layout: SceneLayout) -> Record:
 
     parts = {}
     for name in ("kinetic", "potential", "dissipation"):
-        with formula(scene, name):
+        with formula(scene, name), apart(name == "potential"):
             parts[name] = single_expression(run(name))
-    with formula(scene, "applied"):
+    with formula(scene, "applied"), apart():
         applied = _by_name(run("applied"), names, "coordinate")
     with formula(scene, "rests"):
         rests = _by_name(copy.rests(), names[len(layout.free) :], "prescribed coordinate")

@@ -306,7 +306,10 @@ class Scene(metaclass=SceneType):
         v = Values(
             "velocity of a coordinate", {name: LaneArray(point.values[velocity(name)]) for name in names}
         )
-        given = self.kinetic(q, v, LaneArrayFunctions), self.potential(q, LaneArrayFunctions)
+        try:
+            given = self.kinetic(q, v, LaneArrayFunctions), self.potential(q, LaneArrayFunctions)
+        except ArithmeticError as error:
+            raise ValueError(f"the energy is undefined with these parameters, {error}: {self}") from error
         kinetic, potential = (x.value if isinstance(x, LaneArray) else x for x in given)
         energies = {"kinetic": kinetic, "potential": potential, "total": kinetic + potential}
         if self.mechanics.gyroscopic is not None:

@@ -296,8 +296,8 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
         raise ValueError(
-            f"the motion has no derivative with respect to the parameters at {given}: {error}; leave out "
-            "those that are 0 and that a formula divides by"
+            f"the motion has no derivative with respect to the parameters at {given}; leave out those that "
+            "are 0 and that a formula divides by or takes the root of"
         ) from error
     return known[by]
 

@@ -19,7 +19,9 @@ import numbers
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
+
+from lag_envs.mechanics.algebra import FormulaError
 
 #: Adding this to a number below 2^51 and subtracting it again gives the nearest integer, ties to even.
 MAGIC = 1.5 * 2.0**52
@@ -142,7 +144,7 @@ class TracedNumber:
     def __pow__(self, exponent: Any) -> Any:
         whole = not isinstance(exponent, bool) and isinstance(exponent, numbers.Real)
         if not whole or float(exponent) != int(float(exponent)):
-            raise TypeError(
+            raise FormulaError(
                 f"the power {exponent!r} is not a whole number; write xp.sqrt(x) or xp.exp(p * xp.log(x))"
             )
         power: Any = 1.0
@@ -155,12 +157,38 @@ class TracedNumber:
         return self.trace.record("~", self)
 
     def __float__(self) -> float:
-        raise TypeError(
+        raise FormulaError(
             "a function of math, or float(), is applied to a recorded number: write xp.exp for math.exp"
         )
 
+    def __eq__(self, other: object) -> NoReturn:
+        raise FormulaError(
+            "a recorded number is compared by ==, != or in, which rounding decides; use < and <=, or branch "
+            "on a field that is no parameter"
+        )
+
+    __ne__ = __eq__
+
+    def __hash__(self) -> NoReturn:
+        raise FormulaError(
+            "a recorded number is looked up in a table, set or cache; use xp.where, or look up a field that "
+            "is no parameter"
+        )
+
+    def __mod__(self, other: Any) -> NoReturn:
+        raise FormulaError(
+            "a formula that is compiled has no %, // or divmod(); a % b is a - b * xp.floor(a / b)"
+        )
+
+    __rmod__ = __floordiv__ = __rfloordiv__ = __divmod__ = __rdivmod__ = __mod__
+
+    def __round__(self, digits: Any = None) -> NoReturn:
+        raise FormulaError("a formula that is compiled has no round(); write xp.floor(x + 0.5)")
+
+    __floor__ = __ceil__ = __trunc__ = __int__ = __index__ = __round__
+
     def __bool__(self) -> bool:
-        raise TypeError(
+        raise FormulaError(
             "a formula that is compiled cannot branch on its numbers with if, and, or, min or max; "
             "use xp.where, &, |, xp.minimum and xp.maximum"
         )
