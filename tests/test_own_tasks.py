@@ -348,6 +348,8 @@ def _mistaken(**changes):
         ({"action": {"push": "far", "pull": 1.0}}, r"^Mistaken.action\['push'\] must be a real number"),
         ({"action": {"push": [1.0, 2.0], "pull": 1.0}}, "mixes lists of values with ranges"),
         ({"action": {"push": [1.0]}}, "at least two values"),
+        ({"action": {"push": [1.0, 1.0]}}, r"at least two values, each once, got \[1.0, 1.0\]"),
+        ({"scaled": "no"}, "Mistaken.scaled must be True or False, got 'no'"),
         ({"action": {"push": np.ones((2, 2))}}, r"action\['push'\] must be a real number, got array"),
         ({"start": {"y": 0.1}}, r"start\['y'\]: the state has no such entry, only x, x_dot"),
         ({"start": {"x": "far"}}, r"^Mistaken.start\['x'\] must be a real number, got 'far'"),

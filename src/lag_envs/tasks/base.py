@@ -216,6 +216,8 @@ class Task:
         self.scene = kind(**self.given)
         if self.order is not None:
             vars(self.scene)[ORDER] = check_order(f"{of}.order", self.order)
+        if not isinstance(self.scaled, bool):
+            raise ValueError(f"{of}.scaled must be True or False, got {self.scaled!r:.60}")
         interval = check_number(f"{of}.interval", self.interval, "s")
         self.dt = interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:

@@ -633,8 +633,8 @@ def _acting(task: Task) -> list[Acting]:
             raise FormulaError(f"{where}: the scene has no such control, only {', '.join(known) or 'none'}")
         if isinstance(given, list | range) or (isinstance(given, np.ndarray) and given.ndim):
             values = _numbers_of(where, given)
-            if len(values) < 2:
-                raise FormulaError(f"{where} must list at least two values, got {given!r}")
+            if len(set(values)) < max(2, len(values)):
+                raise FormulaError(f"{where} must list at least two values, each once, got {given!r}")
             found.append(Acting(name, known[name], min(values), max(values), values))
             continue
         pair = _numbers_of(where, given if isinstance(given, tuple) else (given,))
