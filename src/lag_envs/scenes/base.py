@@ -298,7 +298,7 @@ class Scene(metaclass=SceneType):
         state : array_like, shape (..., n_state)
             One state or many.
         control : array_like, shape (..., n_controls), optional
-            The held controls; they matter if a velocity depends on them.
+            The held controls, 0 by default; they matter where a control sets a coordinate's rate.
         """
         point, shape = self._point(state, control)
         names = layout_of(self).names
@@ -331,7 +331,7 @@ class Scene(metaclass=SceneType):
         state : array_like, shape (..., n_state)
             One state or many.
         control : array_like, shape (..., n_controls), optional
-            The held controls.
+            The held controls, 0 by default; they matter in every driven scene.
         """
         point, shape = self._point(state, control)
         layout = layout_of(self)
