@@ -162,21 +162,23 @@ def test_a_checkpoint_that_does_not_fit_is_told_in_a_line(tmp_path):
         go(make_run(tmp_path))
 
 
-@pytest.mark.parametrize("frames", [1, 3])
-def test_the_policy_that_was_written_is_the_one_that_was_evaluated(frames, tmp_path):
-    run = make_run(tmp_path, frames=frames)
+@pytest.mark.parametrize(
+    ("task", "frames"), [(TASKS[ENV], 1), (TASKS[ENV], 3), (Centre, 1), (Jerky, 1), (Row, 3)]
+)
+def test_the_policy_that_was_written_is_the_one_that_was_evaluated(task, frames, own, tmp_path):
+    run = make_run(tmp_path, task.id, frames=frames)
     go(run)
     result = json.loads(run.path(RESULT).read_text())
-    for policy in (
-        load_policy(tmp_path),
-        exported(find([tmp_path])[0], ENV).agent,
-        watch.load_agent(ENV, TASKS[ENV](), str(tmp_path))[1],
-    ):
-        assert play(ENV, policy, fresh_seeds(20)).tolist() == result["evaluation"]["returns"]
-    with pytest.raises(UserError, match=f"is an agent of {ENV}, not of OwnCentre-v0"):
-        watch.load_agent("OwnCentre-v0", Centre(), str(tmp_path))
-    with pytest.raises(UserError, match="act in the package's environments alone"):
-        watch.load_agent("OwnCentre-v0", Centre(), str(run.path(MODEL)))
+    policies = [load_policy(tmp_path), watch.load_agent(task.id, task(), str(tmp_path))[1]]
+    if task.id in TASKS:
+        policies.append(exported(find([tmp_path])[0], task.id).agent)
+    for policy in policies:
+        assert play(task.id, policy, fresh_seeds(20)).tolist() == result["evaluation"]["returns"]
+    with pytest.raises(UserError, match=f"is an agent of {task.id}, not of Other-v0"):
+        watch.load_agent("Other-v0", Centre(), str(tmp_path))
+    other = {Centre: TASKS[ENV], Jerky: Row, Row: Jerky}.get(task, Centre)
+    with pytest.raises(UserError, match=f"do not fit {other.id}, which asks for"):
+        watch.load_agent(other.id, other(), str(run.path(MODEL)))
     assert result["versions"]["torch"] and result["hyperparameters"] == run.hyperparameters
 
 

@@ -142,10 +142,8 @@ def _model(env_id: str, task: Any, path: Path) -> Any:
         source = export.find([path])[0]
         if (of := (source.result or {}).get("env", env_id)) != env_id:
             raise UserError(f"{source.model.parent} is an agent of {of}, not of {env_id}")
-        if export.arrays_of(source.model) is not None:
-            if env_id not in TASKS:
-                raise UserError(f"{path} holds only arrays, which act in the package's environments alone")
-            return export.exported(source, env_id).agent
+        if (network := export.arrays_of(source.model)) is not None:
+            return export.own_agent(source, env_id, task, *network)
         import stable_baselines3  # noqa: F401
 
         model, normalise = export.load_model(source, export.algorithm_of(source))

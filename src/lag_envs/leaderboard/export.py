@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 from lag_envs.errors import UserError, hint
 from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.architecture import POLICY, Architecture
+from lag_envs.leaderboard.fields import accepted
+from lag_envs.leaderboard.networks import MLP
 from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.leaderboard.submission import Refused, Submission, write
@@ -354,14 +357,27 @@ def exported(source: Source, env: str, algo: str | None = None) -> Exported:
         table, arrays = convert(model, task, normalise, source.frames)
         policy = ModelPolicy(model, task, normalise, source.frames)
     try:
-        made = architecture(env, table)
-        shapes = {key: value.shape for key, value in arrays.items()}
-        if shapes != made.arrays:
-            raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")
-        agent = made.agent({k: v.astype(np.float64) for k, v in arrays.items()})
+        agent = _agent(architecture(env, table), env, arrays)
     except Refused as error:
         raise ExportError(f"{source.model}: {error}") from error
     return Exported(table, arrays, agent, policy)
+
+
+def own_agent(
+    source: Source, env: str, task: Task, table: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> Any:
+    """Return the agent of `arrays_of`, for any task; raise ExportError where it does not fit."""
+    try:
+        return _agent(MLP(env, accepted(MLP.table, dict(table), POLICY), task), env, arrays)
+    except Refused as error:
+        raise ExportError(f"{source.model}: {error}") from error
+
+
+def _agent(made: Architecture, env: str, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    shapes = {key: value.shape for key, value in arrays.items()}
+    if shapes != made.arrays:
+        raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")
+    return made.agent({k: v.astype(np.float64) for k, v in arrays.items()})
 
 
 # --- exporting ----------------------------------------------------------------------------------------------

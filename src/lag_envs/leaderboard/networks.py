@@ -178,8 +178,8 @@ class MLP(Network):
 
     table = MLPTable
 
-    def __init__(self, env_id: str, table: MLPTable) -> None:
-        task = TASKS[env_id]()
+    def __init__(self, env_id: str, table: MLPTable, task: Task | None = None) -> None:
+        task = TASKS[env_id]() if task is None else task
         self.frames, self.padding = table.frames, table.padding
         if "frames" in table.model_fields_set:
             self.schema = 2
