@@ -564,14 +564,24 @@ def policy_of(settings: Mapping[str, Any], model: Any, normalise: Any) -> ModelP
     return ModelPolicy(model, make_task(settings["env"]), normalise, frames)
 
 
-def load_policy(folder: Path) -> Any:
+def load_policy(folder: str | Path) -> Any:
     """Return the policy of a finished run.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The run's folder, ``FOLDER/ENV/ALGO/seed<K>``.
 
     Raises
     ------
     UserError
         If the folder holds no finished run, or a damaged one.
     """
+    folder = Path(folder)
+    if folder.is_file():
+        raise UserError(f"{folder} is a file; give the folder in which it lies, {folder.parent}")
+    if not (folder / RESULT).exists():
+        raise UserError(f"there is no finished run in {folder}: it has no {RESULT}")
     result = read_result(folder / RESULT)
     try:
         if result["algo"] in OWN:

@@ -50,7 +50,8 @@ from lag_envs.workers import check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
-  model.zip            the policy: agents.learners.load_policy plays any, stable_baselines3's load its own
+  model.zip            the policy: agents.learners.load_policy takes the folder of any learner's, the load of
+                       stable_baselines3 this file of its own learners
   tensorboard/         for `tensorboard --logdir FOLDER`, of Stable-Baselines3's learners
   {CHECKPOINT}       while the run is not finished: everything needed to resume ({TESTS} times a run)
 

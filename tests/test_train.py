@@ -326,6 +326,17 @@ def test_a_damaged_result_is_named(content, tmp_path):
         load_policy(tmp_path)
 
 
+def test_what_is_no_folder_of_a_run_is_named(tmp_path):
+    (tmp_path / run.MODEL).touch()
+    for given, message in (
+        (str(tmp_path), f"there is no finished run in {tmp_path}: it has no result.json"),
+        (tmp_path / "x", f"there is no finished run in {tmp_path / 'x'}"),
+        (tmp_path / run.MODEL, f"model.zip is a file; give the folder in which it lies, {tmp_path}"),
+    ):
+        with pytest.raises(UserError, match=re.escape(message)):
+            load_policy(given)
+
+
 def test_a_damaged_model_is_named(tmp_path):
     going = make_run(tmp_path, steps=100)
     go(going)
