@@ -42,7 +42,7 @@ from lag_envs.tasks.registration import make_task
 
 EPISODES = 20
 EPILOG = """files in the output folder:
-  model.zip            the policy: agents.learners.load_policy takes the folder
+  model.zip            the policy: give the folder to agents.learners.load_policy
   learning_curve.png   returns while training, beside the controllers and the random policy
   episode.mp4          one fresh episode of the trained policy
   comparison.json      returns and scores of all agents on the same fresh episodes

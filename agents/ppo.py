@@ -395,7 +395,7 @@ class Learner:
 
 EPILOG = f"""what is left in FOLDER/ENV/{NAME}/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, settings, versions, times
-  model.zip            the network's weights: numpy.load reads it; agents.learners.load_policy takes the folder
+  model.zip            weights, for numpy.load; the policy: give the folder to agents.learners.load_policy
   {CHECKPOINT}       while the run is not finished: everything needed to resume
 
 The same seed gives the same policy, bit for bit, even if the training was interrupted (by Ctrl-C or by a

@@ -50,10 +50,10 @@ from lag_envs.workers import check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
-  model.zip            the policy: agents.learners.load_policy takes the folder of any learner's, the load of
-                       stable_baselines3 this file of its own learners
+  model.zip            the policy: give the folder to agents.learners.load_policy, or this file to the load of
+                       Stable-Baselines3, if it is one of its learners
   tensorboard/         for `tensorboard --logdir FOLDER`, of Stable-Baselines3's learners
-  {CHECKPOINT}       while the run is not finished: everything needed to resume ({TESTS} times a run)
+  {CHECKPOINT}       while the run is not finished: everything needed to resume; written {TESTS} times per run
 
 Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; finished seeds are left as they are.
 A run resumes from its last checkpoint: for fast_ppo, shac and cloning with the same result as without the

@@ -15,7 +15,6 @@ from lag_envs.envs.screen import check_display
 from lag_envs.errors import UserError, hint
 from lag_envs.leaderboard.shipped import shipped
 from lag_envs.scores import in_words
-from lag_envs.tasks import TASKS
 
 #: Supported extensions of video files.
 VIDEOS = (".mp4", ".gif")
