@@ -153,6 +153,10 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     from lag_envs.benchmark.device import measured
     from lag_envs.device import checked_device
 
+    if not args.device.startswith("cuda"):
+        raise UserError(
+            f"--device must be cuda or cuda:N, got {args.device!r}; leave it out for the processor"
+        )
     try:
         device = checked_device(args.device)
     except ValueError as error:
