@@ -170,9 +170,19 @@ def test_adapter_passes_on_what_wrappers_report():
     assert envs.get_attr("episode_count") == [2, 2]
 
 
-def test_adapter_refuses_another_autoreset_mode():
+def test_adapter_refuses_other_environments():
     with pytest.raises(ValueError, match="SameStep"):
         VecEnv(gym.make_vec(ENV, 2))
+    with pytest.raises(TypeError, match="a vector environment is needed, as from make_vec_env, got "):
+        VecEnv(gym.make(ENV))
+
+
+def test_keywords_of_stable_baselines3():
+    envs, other = make_vec_env(ENV, 2, seed=3), make_vec_env(ENV, 2)
+    other.seed(3)
+    np.testing.assert_array_equal(envs.reset(), other.reset())
+    with pytest.raises(TypeError, match="themselves in place of env_kwargs"):
+        make_vec_env(ENV, 2, env_kwargs={"mass": 0.1})
 
 
 def test_staggered_starts():

@@ -32,7 +32,9 @@ from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.networks import bin_centres
 
 
-def make_vec_env(env_id: str, num_envs: int, *, stagger: int = 0, **options: Any) -> VecEnv:
+def make_vec_env(
+    env_id: str, num_envs: int, *, seed: int | None = None, stagger: int = 0, **options: Any
+) -> VecEnv:
     """Return a native vector environment for Stable-Baselines3.
 
     Parameters
@@ -41,6 +43,8 @@ def make_vec_env(env_id: str, num_envs: int, *, stagger: int = 0, **options: Any
         Id of an environment.
     num_envs : int
         Number of environments.
+    seed : int, optional
+        Seed of the first environment's first episode, as for `VecEnv.seed`.
     stagger : int, default 0
         See `VecEnv`.
     **options
@@ -53,7 +57,12 @@ def make_vec_env(env_id: str, num_envs: int, *, stagger: int = 0, **options: Any
     >>> env.reset().shape
     (3, 5)
     """
-    return VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), stagger=stagger)
+    if "env_kwargs" in options:
+        raise TypeError("write the parameters themselves in place of env_kwargs, as in duration=5.0")
+    envs = VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), stagger=stagger)
+    if seed is not None:
+        envs.seed(seed)
+    return envs
 
 
 class VecEnv(vec_env.VecEnv):
@@ -71,11 +80,15 @@ class VecEnv(vec_env.VecEnv):
 
     Raises
     ------
+    TypeError
+        For a single environment.
     ValueError
         For an environment with another autoreset mode.
     """
 
     def __init__(self, env: VectorEnv, *, stagger: int = 0) -> None:
+        if not isinstance(env, VectorEnv):
+            raise TypeError(f"a vector environment is needed, as from make_vec_env, got {env}")
         mode = env.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(f'the environment must be made with autoreset_mode="SameStep", got {mode}')
