@@ -664,6 +664,13 @@ def test_misspelt_names_are_noticed():
         _mistaken(rewards=2.0, reward=lambda self, before, after, *_: self.rewards * after.x)()
 
 
+def test_what_cannot_be_registered_is_named():
+    with pytest.raises(ValueError, match="Crane is a Scene; register a Task whose scene it is"):
+        lag_envs.register(own_tasks.Crane)
+    with pytest.raises(ValueError, match='Blank has no id; write id = "Blank-v0" into the class'):
+        lag_envs.register(type("Blank", (own_tasks.Deliver,), {"id": ""}))
+
+
 def test_comparisons_count_as_one_and_zero():
     class Counted(own_tasks.Deliver):
         id = "OwnCounted-v0"

@@ -31,7 +31,7 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
     Raises
     ------
     ValueError
-        If there is no id.
+        If there is no id, or the class is a scene.
 
     Notes
     -----
@@ -40,6 +40,10 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
     which Gymnasium's `AsyncVectorEnv` and Stable-Baselines3's `SubprocVecEnv` use.
     """
     if isinstance(task, type):
+        from lag_envs.scenes import Scene
+
+        if issubclass(task, Scene):
+            raise ValueError(f"{task.__name__} is a Scene; register a Task whose scene it is")
         id = id or getattr(task, "id", "")
         if not id:
             raise ValueError(f'{task.__name__} has no id; write id = "{task.__name__}-v0" into the class')
