@@ -54,6 +54,7 @@ other programs do.
 On a terminal a table shows each training while it runs. One that fails is named, and does not count.
 
 The time to a score is that of the first test that reaches it; it is infinite for a training that never does.
+The last rows of the table have the scores of the evaluation at the end: the median, and the range.
 A training that has ended is not started again. Tests do not influence training.
 
 examples:
@@ -154,7 +155,7 @@ def trainings(args: argparse.Namespace, names: Sequence[str], seeds: range) -> I
 def earlier_rows(file: Path) -> list[dict[str, Any]]:
     """Return the trainings that a file holds, or raise a UserError if it holds others' rows.
 
-    Lines that are no rows, such as one that was cut off, are named and left out.
+    Lines that are not rows, such as one that was cut off, are named and left out.
     """
     found = list(store.rows(file))
     refuse = f"{file} is not a file of a race ({{}}); choose another --output, or remove it"
@@ -169,8 +170,8 @@ def earlier_rows(file: Path) -> list[dict[str, Any]]:
             raise UserError(refuse.format(f"row {number}: {what}")) from error
     lines = sum(bool(line.strip()) for line in file.read_bytes().splitlines()) if file.exists() else 0
     if left := lines - len(found):
-        what = "1 line that is" if left == 1 else f"{left} lines that are"
-        print(f"{file}: {what} no JSON left out; a row that was cut off is trained again", file=sys.stderr)
+        what = "1 line that is not JSON was" if left == 1 else f"{left} lines that are not JSON were"
+        print(f"{file}: {what} left out; a row that was cut off is trained again", file=sys.stderr)
     return found
 
 
@@ -299,7 +300,8 @@ def told(row: dict[str, Any]) -> str:
         else f"{level:g} in {time:.1f} s"
         for level in LEVELS
     )
-    return f"{when}; {row['score']:.3f} after {row['seconds']:.1f} s, process {row['process_seconds']:.1f} s"
+    times = f"trained for {row['seconds']:.1f} s, process {row['process_seconds']:.1f} s"
+    return f"{when}; {times}; evaluation at the end: {row['score']:.3f}"
 
 
 def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
@@ -333,7 +335,7 @@ def score_cells(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
         cells.append(
             (
                 learner_label(name),
-                "end",
+                "evaluation",
                 f"{np.median(ends):.4f}",
                 spread,
                 "whole process",

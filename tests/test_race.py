@@ -59,8 +59,8 @@ def test_a_training_that_fails_costs_only_itself(command, tmp_path):
     status, output = command("--seeds", "3", "--output", str(file))
     assert status == 1
     assert "seed 0: failed: no such luck\n" in output and "seed 1: failed: OSError: [Errno 28] No" in output
-    assert "seed 2: 0.9 in 3.0 s, 0.97 never" in output
-    assert "fast PPO  0.9    1 of 1   1,000" in output
+    assert "seed 2: 0.9 in 3.0 s, 0.97 never" in output and "s; evaluation at the end: 0.950\n" in output
+    assert "fast PPO  0.9         1 of 1   1,000" in output
     (row,) = map(json.loads, file.read_text().splitlines())
     assert row["seed"] == 2 and row["machine"] == FOUND["machine"] and FOUND.items() <= row.items()
     # The one that worked is not trained again.
@@ -92,7 +92,7 @@ def test_an_interrupted_race_shows_what_it_has(command, tmp_path, monkeypatch):
     monkeypatch.setattr(race, "train_seed", train)
     given = ["--first-seed", "2", "--seeds", "2"]
     status, output = command(*given, "--output", str(tmp_path / "race.jsonl"))
-    assert status == 130 and "fast PPO  0.9    1 of 1" in output and "Traceback" not in output
+    assert status == 130 and "fast PPO  0.9         1 of 1" in output and "Traceback" not in output
     assert "Stopped. What was finished is kept; re-run" in output
     assert "kept" not in command(*given)[1]
 
@@ -108,7 +108,7 @@ def test_a_full_disk_costs_no_table(command, tmp_path, monkeypatch):
             status, output = command("--first-seed", "2", "--seeds", "1", *given)
         assert status == 1 and "agents.race: error:" in output and given[1] in output
         assert not picture.exists() and not file.exists()
-    assert "fast PPO  0.9    1 of 1" in output
+    assert "fast PPO  0.9         1 of 1" in output
 
 
 def test_a_disk_without_room_is_named_before_the_work(tmp_path):
@@ -190,7 +190,7 @@ def test_a_row_that_was_cut_off_is_trained_again(command, tmp_path):
     first, second = file.read_text().splitlines()
     file.write_text(first + "\n" + second[:40])
     status, output = command(*given, "--output", str(file))
-    assert status == 0 and "race.jsonl: 1 line that is no JSON left out" in output
+    assert status == 0 and "race.jsonl: 1 line that is not JSON was left out" in output
     rows = file.read_text().splitlines()
     assert rows[0] == first and json.loads(rows[2])["seed"] == 3
 
