@@ -59,6 +59,11 @@ def test_energy_of_lag_envs_and_of_others(runs):
     assert conservation.exponent(rk4["steps"], rk4["energy"]) == pytest.approx(1.0, abs=0.1)
 
 
+def test_a_report_without_drifts_says_nothing_of_their_steps():
+    found = conservation.content(conservation.energy_imbalance("CylinderInCylinder, tilt", 2), [])
+    assert len(found.claims) == 3 and not any(" 0 " in text for text in (*found.text, *claims(found)))
+
+
 def test_march_is_simulate():
     """The loop of the long runs gives the bits of `Scene.simulate`."""
     problem = conservation.FREE["bar, turning over"]
