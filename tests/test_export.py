@@ -188,7 +188,9 @@ def test_command_exports_files(runs, tmp_path):
     given += ["--seconds", 5]
     with pytest.raises(UserError, match="one file for each path"):
         export_command(*given, "--normalise", norms[0])
-    with pytest.raises(UserError, match="do not fit Brake"):
+    with pytest.raises(
+        UserError, match=rf"takes 4 numbers; {incline.Brake.id} has . per observation\. Is --env right"
+    ):
         export_command(*given, "--env", incline.Brake.id)
     with pytest.raises(UserError, match="there is no environment 'x'"):
         export_command(*given, "--env", "x")
@@ -205,7 +207,7 @@ def test_models_that_cannot_be_exported(runs, tmp_path):
     with pytest.raises(export.ExportError, match="all activations must be one of"):
         export.convert(made, TASKS[ENV]())
     with pytest.raises(
-        export.ExportError, match=r"sees .* numbers, which do not fit Tilt with .* and 3 frames; --frames"
+        export.ExportError, match=rf"takes 4 numbers; {ENV} has 4 per observation, 12 in 3 frames\. Is --env"
     ):
         export.convert(made, TASKS[ENV](), frames=3)
     with pytest.raises(export.ExportError, match="is neither a model nor a folder"):

@@ -209,8 +209,9 @@ def convert(
     own, shape = len(task.observation), model.observation_space.shape
     if shape != (frames * own,):
         raise ExportError(
-            f"the model sees {shape} numbers, which do not fit {type(task).__name__} with {own} and "
-            f"{frames} frame{'s' * (frames > 1)}; --frames tells how many a model sees"
+            f"the model takes {'x'.join(map(str, shape or '?'))} numbers; {task.id} has {own} per observation"
+            f"{f', {frames * own} in {frames} frames' if frames > 1 else ''}. Is --env right? If the model "
+            "stacks observations, give --frames"
         )
     if frames > 1:
         table["frames"] = frames
