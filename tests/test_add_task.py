@@ -231,9 +231,7 @@ def test_energy_balance():
     balance = Pendulum(damping=0.1).energy_balance([1.0, 4.0], 2.0, 0.02)
     assert abs(balance["residual"]) < 1e-13
     assert balance["work"] > 0.0 and balance["loss"] > 0.0
-    with pytest.raises(
-        ValueError, match=r"nodes must be a whole number of at least 1 and below 2\*\*63, got 0"
-    ):
+    with pytest.raises(ValueError, match=r"nodes must be a whole number of at least 1, got 0"):
         Pendulum().energy_balance([1.0, 4.0], 2.0, 0.02, nodes=0)
     with pytest.raises(ValueError, match=r"one set of controls, got shape \(2, 1\)"):
         Pendulum().energy_balance([1.0, 4.0], [2.0, 1.0], 0.02)

@@ -550,6 +550,7 @@ def test_refused_step_keeps_the_rows_before():
         ([0.0, 0.0, 0.0], [1.0], 0.02, r"state must be \(theta, theta_dot\), got .* \(3,\)"),
         ([0.0, math.nan], [1.0], 0.02, "state must be finite, got .*theta_dot"),
         ("ab", [1.0], 0.02, "state must be real numbers"),
+        ({"theta": 1.0}, [1.0], 0.02, r"must be \(theta, theta_dot\), without names, got {'theta': 1.0}"),
         ([0.0, 0.0], [1.0], 0.0, "dt must be above 0 s, got 0 s"),
         ([0.0, 0.0], [1.0], -0.02, "dt must be above 0 s, got -0.02 s"),
         ([0.0, 0.0], [1.0], 1e-320, "dt must be above 0 s"),

@@ -531,6 +531,7 @@ def test_step_before_reset():
         ({"state": [[0, 0, 0, 0], [0, 0, 0, 0], [0.6, 0, 0, 0]]}, ValueError, "track"),
         ({"state": [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, math.nan, 0]]}, ValueError, "finite"),
         ({"state": "up"}, ValueError, "state"),
+        ({"state": {"s": 0.1}}, ValueError, r"rows of \(s, s_dot, theta, theta_dot\), without names"),
         ({"target": np.zeros(3)}, ValueError, "no target"),
         ({"colour": 1}, ValueError, "unknown reset option 'colour'"),
     ],

@@ -215,6 +215,9 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         state, target, mask = start_options(options, ("state", "target", "reset_mask"))
         mask = self._check_mask(mask)
         lanes = self._lanes[mask]
+        if isinstance(state, Mapping):
+            names = ", ".join(self.scene.state_names)
+            raise ValueError(f"options['state'] must be rows of ({names}), without names, got {shown(state)}")
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
             state = np.array([for_environment(i, self.tasks[i].start_state, state[i]) for i in lanes])

@@ -97,7 +97,10 @@ def check_state(scene: Any, state: ArrayLike) -> Array:
 
 def check_states(scene: Any, states: ArrayLike) -> Array:
     """Return states as a float64 array of shape (..., n_state), or raise a ValueError."""
-    array, names = real_array("state", states), scene.state_names
+    names = scene.state_names
+    if isinstance(states, Mapping):
+        raise ValueError(f"state must be ({', '.join(names)}), without names, got {shown(states)}")
+    array = real_array("state", states)
     if array.shape[-1:] != (len(names),):
         raise ValueError(f"state must be ({', '.join(names)}), got shape {array.shape}: {shown(states)}")
     bad = ~np.isfinite(array)
@@ -246,5 +249,6 @@ def check_count(name: str, value: Any) -> int:
     """Return an integer of at least 1 as int, or raise a ValueError."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
     if not whole or not 1 <= value < 2**63:
-        raise ValueError(f"{name} must be a whole number of at least 1 and below 2**63, got {shown(value)}")
+        most = " and below 2**63" if whole and value > 0 else ""
+        raise ValueError(f"{name} must be a whole number of at least 1{most}, got {shown(value)}")
     return int(value)
