@@ -120,10 +120,13 @@ def _look(args: argparse.Namespace) -> dict[str, Any]:
 def _shown(args: argparse.Namespace) -> tuple[str, Task]:
     """Return id and task of the environment to show."""
     from lag_envs import own_files
+    from lag_envs.envs.interface import LONGEST_TRAIL
     from lag_envs.tasks.registration import make_task
 
     if args.seed is not None and args.seed < 0:
         raise UserError(f"--seed must be at least 0, got {args.seed}")
+    if args.trail > LONGEST_TRAIL:
+        raise UserError(f"--trail must be at most {LONGEST_TRAIL:g} s, got {args.trail:g}")
     if not is_file(args.id):
         return (id := known_id(args.id)), make_task(id)
     task, path = own_files.one(args.id), own_files.split_path(args.id)[0]

@@ -18,6 +18,8 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import seen_box
 
 RENDER_MODES = ["human", "rgb_array"]
+#: The longest time for which `show_trail` shows the path [s].
+LONGEST_TRAIL = 60.0
 FLOAT32 = np.dtype(np.float32)
 
 
@@ -101,8 +103,8 @@ def check_look(arrows: Any, trail: Any, readout: Any) -> tuple[bool, float, bool
     check_flag("show_arrows", arrows)
     check_flag("show_readout", readout)
     seconds = check_number("show_trail", trail, "s")
-    if not 0.0 <= seconds <= 60.0:
-        raise ValueError(f"show_trail must lie between 0 and 60 s, got {shown(trail)}")
+    if not 0.0 <= seconds <= LONGEST_TRAIL:
+        raise ValueError(f"show_trail must lie between 0 and {LONGEST_TRAIL:g} s, got {shown(trail)}")
     return bool(arrows), seconds, bool(readout)
 
 
