@@ -151,4 +151,4 @@ def expert(task: Task, name: str) -> Any:
 
 
 if __name__ == "__main__":
-    raise SystemExit("To train it: python -m agents.train ENV --algo cloning; --help says more")
+    raise SystemExit("To train it: python -m agents.train ENV --algo cloning (python -m agents.train --help)")

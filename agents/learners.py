@@ -213,7 +213,10 @@ def check_suits(algo: str, env_id: str) -> None:
     task = make_task(env_id)
     if not suits(algo, task):
         fit = ", ".join(name for name in LEARNERS if suits(name, task))
-        raise UserError(f"{algo} does not learn actions of {env_id}'s kind; available: {fit}")
+        needs, has = "continuous actions", "discrete ones"
+        if algo == "dqn":
+            needs, has = "one discrete action", "several" if task.formulas.actions > 1 else "a continuous one"
+        raise UserError(f"{algo} needs {needs}; {env_id} has {has}; available: {fit}")
 
 
 def check_trainable(algo: str, env_id: str) -> None:

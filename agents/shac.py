@@ -61,7 +61,7 @@ class Settings(LearnerSettings):
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
     max_slope: float = Field(gt=0, description="largest norm of a step's derivatives")
-    reward_scale: float = Field(ge=0, description="factor of the rewards")
+    reward_scale: float = Field(gt=0, description="factor of the rewards")
     episode_share: float = Field(gt=0, le=1, description="share of its length at which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
     start_ranges: dict[str, NonNegativeFloat] = Field(description="half widths of random starts")
@@ -328,4 +328,4 @@ def one_axis(rows: Array | None) -> Array | None:
 
 
 if __name__ == "__main__":
-    raise SystemExit("To train it: python -m agents.train ENV --algo shac; --help says more")
+    raise SystemExit("To train it: python -m agents.train ENV --algo shac (python -m agents.train --help)")

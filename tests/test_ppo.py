@@ -397,6 +397,8 @@ def test_settings_of_another_kind_are_refused():
         ({"state_noise": 1}, "state_noise: Input should be a valid boolean, got 1"),
         ({"n_steps": 2.5}, "n_steps: Input should be a valid integer, got 2.5"),
         ({"actor": 32}, "actor: Input should be a valid list, got 32"),
+        ({"reward_scale": 0}, "reward_scale: Input should be greater than 0, got 0"),
+        ({"clip_range": 0}, "clip_range: Input should be greater than 0, got 0"),
         ({"gamma": "x"}, "gamma: Input should be a valid number, got 'x'"),
     ):
         with pytest.raises(UserError, match=message):

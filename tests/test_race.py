@@ -140,7 +140,7 @@ def test_a_disk_without_room_is_named_before_the_work(tmp_path):
         ),
         (
             ["--learners", "fast_ppo", "dqn"],
-            f"dqn does not learn actions of {ENV}'s kind; available: ppo, sac",
+            f"dqn needs one discrete action; {ENV} has a continuous one; available: ppo, sac",
         ),
         (["--learners", "fast_ppp"], "did you mean fast_ppo"),
         (["--output", os.devnull], "is not a regular file"),
@@ -163,7 +163,7 @@ def test_a_task_of_ones_own_is_for_other_commands(module, name, capsys):
 @pytest.mark.parametrize("name", ["shac", "cloning", "sac"])
 def test_discrete_actions_do_not_suit_every_learner(name, capsys):
     assert race.main([cart_pole.CartPoleExact.id, "--learners", name]) == 2
-    assert f"{name} does not learn actions of" in capsys.readouterr().err
+    assert f"{name} needs continuous actions; CartPole" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,7 @@ def test_it_swings_the_bar_up(env_id, changes, least):
         ("cloning", cart_pole.CartPoleExact.id, {}, "has discrete ones; try fast_ppo"),
         ("cloning", FREE, {"controller": "LQG"}, "no controller 'LQG'"),
         ("cloning", FREE, {"batch_size": 0}, "settings of cloning: batch_size: "),
+        ("shac", FREE, {"reward_scale": 0}, "settings of shac: reward_scale: "),
     ],
 )  # fmt: skip
 def test_mistakes_are_named(algo, env_id, changes, message):

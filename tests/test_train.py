@@ -461,10 +461,10 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, for each to have episodes"),
         ([ENV, "--seeds", "1001"], "episodes of its own; got up to 1000"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
-        ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac does not learn actions of CartPole"),
+        ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac needs continuous actions; CartPole"),
         (
             [Reach.id, "--algo", "dqn"],
-            f"dqn does not learn actions of {Reach.id}'s kind; available: ppo, sac",
+            f"dqn needs one discrete action; {Reach.id} has several; available: ppo, sac",
         ),
     ],
 )
@@ -651,8 +651,8 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
-        slow([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not learn actions of OwnSwitched-v0's kind"),
-        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn does not learn actions of OwnCrane-v0's kind"),
+        slow([f"{SEVERAL}:Switched", "--algo", "sac"], "continuous actions; OwnSwitched-v0 has discrete"),
+        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "needs one discrete action; OwnCrane-v0 has several"),
         slow([f"{SEVERAL}:Drift"], "OwnDrift-v0 has no control: there is nothing to learn"),
     ],
 )
