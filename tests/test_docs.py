@@ -466,9 +466,9 @@ def test_speeds():
         assert float(time.replace(",", "")) == pytest.approx(1e9 / row["steps_per_second"][1], rel=6e-3)
         assert agrees(ratio, row["ratio"][1])
         assert ("missed" in cell) == (target.meant_for(row) and row["ratio"][1] < target.ratio)
-    claim = "A step of `PivotedBar-v0` takes less than a fifth of the"
+    claim = "A step of `PivotedBar-v0` takes about a fifth of the"
     assert claim in (ROOT / "README.md").read_text(encoding="utf-8")
-    assert found["PivotedBar-v0", TARGETS[0].kind, 1]["ratio"][1] > 5.0
+    assert found["PivotedBar-v0", TARGETS[0].kind, 1]["ratio"][1] > 4.5
 
 
 def test_speeds_on_a_gpu():
