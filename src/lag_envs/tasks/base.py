@@ -125,7 +125,7 @@ class Task:
     Parameters
     ----------
     dt : float, optional
-        Control interval [s]. The episode keeps its length in seconds, not in steps.
+        Control interval [s]. The episode keeps its length in seconds, rounded to whole steps.
     duration : float, optional
         Length of an episode [s]; infinity for no end.
     target : float, sequence or mapping, optional
