@@ -3,7 +3,8 @@
 ``python -m agents.ppo --help`` has the options. An iteration lets the policy act in all environments
 (`Learner.collect`), estimates how much better each action was than expected (`Learner.advantages`), and
 makes better actions more likely, within limits (`Learner.update`). The algorithm is that of [1]_, with the
-estimator of [2]_ and the exploration of [3]_.
+estimator of [2]_ and the exploration of [3]_. Settings, resuming and evaluation are in other files of this
+folder: to copy it, take the folder ``agents``.
 
 References
 ----------
