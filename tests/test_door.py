@@ -65,6 +65,14 @@ def mistake(*words):
 
 # --- numbers that cannot be traced -------------------------------------------------------------------------
 
+
+def guarded(of):
+    try:
+        return of()
+    except (TypeError, ValueError):
+        return 0.0
+
+
 UNTRACEABLE = {
     "math function of a coordinate": (
         {"potential": lambda self, q, xp: math.sin(q.x)},
@@ -116,6 +124,14 @@ UNTRACEABLE = {
     "text of a parameter": (
         {"applied": lambda self, q, v, u, xp: {"x": u.force if str(self.mass) == "1.0" else 2.0 * u.force}},
         "applied; another result on plain numbers",
+    ),
+    "a refusal that is caught": (
+        {"potential": lambda self, q, xp: guarded(lambda: 9.81 if self.mass > 0.5 else 1.62) * q.x},
+        "potential; comparison; the formula catches this error",
+    ),
+    "type of a parameter, beside large numbers": (
+        {"potential": lambda self, q, xp: 5e4 * q.x**2 + (9.81 * q.x if type(self.mass) is float else 0.0)},
+        "potential; another result on plain numbers",
     ),
     "recursion": (
         {"potential": lambda self, q, xp: self.potential(q, xp)},
@@ -720,6 +736,32 @@ def test_unknown_parameter():
 def test_bad_state_or_control(call, state, control, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         getattr(Good(), call)(state, control)
+
+
+def test_every_scene_is_tried_on_plain_numbers():
+    """A formula may ask for a type only with some parameters."""
+    stiff = changed(
+        potential=lambda self, q, xp: (
+            (9.0 if isinstance(self.mass, float) and self.mass > 5.0 else 1.0) * q.x**2
+        )
+    )
+    stiff(mass=1.0)
+    with pytest.raises(FormulaError, match="potential gives another result on plain numbers"):
+        stiff(mass=10.0)
+
+
+def test_formulas_without_a_value_at_some_points():
+    """Roots of negative numbers, which Python makes complex, and what cancels."""
+    radius = changed(
+        potential=lambda self, q, xp: -((self.mass**2 - q.x**2) ** 0.5) + ((self.spring - 3.0) ** 0.5) ** 4
+    )
+    assert radius().acceleration([0.1] * 6)["x"] < 0.0
+    cancelling = changed(
+        applied=lambda self, q, v, u, xp: {
+            "x": u.force + self.spring * ((q.x + 1e3) ** 2 - q.x**2 - 2e3 * q.x - 1e6)
+        }
+    )
+    assert cancelling().acceleration([0.0] * 6, [2.0, 0.0])["x"] == 2.0
 
 
 def test_an_energy_that_divides_by_zero():

@@ -374,3 +374,48 @@ def test_so_do_the_step_and_its_derivatives():
     np.testing.assert_allclose(one.simulate(state, 1, 0.02)[-1], after, rtol=0.0, atol=1e-13)
     found, wanted = (scene.jacobian(state, [], 0.02)[0] for scene in (one, other))
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-11 * np.abs(wanted).max())
+
+
+class Damped(Scene):
+    """Two masses in a plane, with a spring and a damper between them."""
+
+    coordinates = {"x1": "m", "y1": "m", "x2": "m", "y2": "m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * sum(w**2 for w in v)
+
+    def potential(self, q, xp):
+        return 5.0 * ((q.x1 - q.x2) ** 2 + (q.y1 - q.y2) ** 2)
+
+    def dissipation(self, q, v, u, xp):
+        dx, dy = q.x1 - q.x2, q.y1 - q.y2
+        return (dx * (v.x1 - v.x2) + dy * (v.y1 - v.y2)) ** 2 / (dx**2 + dy**2)
+
+
+class Forced(Damped):
+    """The damper as a force."""
+
+    def dissipation(self, q, v, u, xp):
+        return 0.0
+
+    def applied(self, q, v, u, xp):
+        dx, dy = q.x1 - q.x2, q.y1 - q.y2
+        f = 2.0 * (dx * (v.x1 - v.x2) + dy * (v.y1 - v.y2)) / (dx**2 + dy**2)
+        return {"x1": -f * dx, "y1": -f * dy, "x2": f * dx, "y2": f * dy}
+
+
+@pytest.mark.parametrize("scene", [Damped(), Forced()], ids=["dissipation", "force"])
+@pytest.mark.parametrize("gap", [1 / 8, 1 / 1024])
+def test_a_damper_does_not_depend_on_where_it_is(scene, gap):
+    """Multiplied out, it was a small difference of squares of places."""
+    near, far = (np.array([x, 0.3, x, -0.2, x + gap, 0.1, x + gap / 2, 0.25]) for x in (0.0, 256.0))
+    assert scene.acceleration(far) == pytest.approx(scene.acceleration(near), rel=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", [Damped(), Forced()], ids=["dissipation", "force"])
+def test_nor_does_its_step(scene):
+    near, far = (np.array([x, 0.3, x, -0.2, x + 1 / 8, 0.1, x + 1 / 16, 0.25]) for x in (0.0, 256.0))
+    assert scene.step_bound(far, [], 0.02).substeps == scene.step_bound(near, [], 0.02).substeps == 1
+    found, wanted = (scene.jacobian(state, [], 0.02)[0] for state in (far, near))
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-11 * np.abs(wanted).max())

@@ -20,7 +20,7 @@ from lag_envs.mechanics.algebra import (
     function_of,
     substitute,
 )
-from lag_envs.mechanics.identities import apply_identities
+from lag_envs.mechanics.identities import apply_identities, shorter
 from lag_envs.scenes import Chain
 from lag_envs.stepping.general import series_code_of
 from lag_envs.stepping.lowering import Lowering
@@ -176,6 +176,27 @@ def test_sums_with_cosines_stay_factors_apart():
     shift = {PLACES[0]: X + 1}  # puts in a place, and takes nothing apart
     assert len(substitute(square, shift).terms) == 1
     assert len(substitute(square, {place: Expr.of(1) for place in PLACES}).terms) == 0
+
+
+def test_a_sum_of_places_stays_apart_from_velocities():
+    (v, w), d = (Expr.of(Atom("velocity", name)) for name in "ab"), X - Y
+    assert len((d * (v - w)).terms) == 4
+    with apart():
+        assert len((d * (v - w)).terms) == 2 and len((d * v).terms) == 1
+        assert (d * (v - w)).same(d * v - d * w) and (2 * C * d * (v - w)).same((v - w) * (2 * C * d))
+        assert len(((X * d) * v).terms) == 1
+        product = d * (v - w)
+    assert len(substitute(product, {PLACES[0]: X + C}).terms) == 2
+    assert substitute(product, {PLACES[0]: Y + C}).same(C * (v - w))
+
+
+def test_squares_are_multiplied_out_where_that_is_shorter():
+    with apart():
+        x, y = (function_of(f, X) - function_of(f, Y) for f in ("sin", "cos"))
+        square, well = x**2 + y**2, (function_of("cos", X) - C) ** 2
+    assert len(square.terms) == 2
+    assert shorter(square).same(2 - 2 * function_of("cos", X - Y))
+    assert shorter(well).same(well) and shorter(function_of("sqrt", square)).same(function_of("sqrt", square))
 
 
 def test_roots_of_fourth_powers_are_squares():

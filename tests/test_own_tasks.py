@@ -333,6 +333,18 @@ def _mistaken(**changes):
     return type("Mistaken", (own_tasks.Deliver,), changes)
 
 
+def _difference(last, x):
+    before, last["f"] = last["f"], x
+    return x - before
+
+
+def _guarded(function, x):
+    try:
+        return function(x)
+    except ValueError:
+        return 0.0
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -379,6 +391,15 @@ def _mistaken(**changes):
         ({"reward": lambda self, *_: 1.0 if self.scene.load_mass != 0.3 else 0.0}, "by ==, != or in"),
         ({"reward": lambda self, b, after, *_: 1.0 if after.x in (0.0, 1.0) else 0.0}, "by ==, != or in"),
         ({"reward": lambda self, *_: {0.3: 1.0}.get(self.scene.load_mass, 0.0)}, "looked up .* xp.where"),
+        ({"reward": lambda self, *_: {"0.3": 1.0}.get(f"{self.scene.load_mass}", 0.0)}, "uses the text of"),
+        (
+            {"reward": lambda self, b, after, c, *_, last={"f": 0.0}: _difference(last, c.push)},
+            "uses a number of an earlier call; it must keep none in a list, a dict",
+        ),
+        (
+            {"reward": lambda self, b, after, *_: _guarded(math.acos, after.x)},
+            "reward: a function of math, .* the formula catches this error, which it must not",
+        ),
         ({"reward": lambda self, b, after, *_: after.x % 2.0}, r"a % b is a - b \* xp.floor\(a / b\)"),
         ({"reward": lambda self, b, after, *_: round(after.x)}, r"write xp.floor\(x \+ 0.5\)"),
         ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),

@@ -38,8 +38,9 @@ _apart: ContextVar[bool] = ContextVar("apart", default=False)
 def apart(wanted: bool = True) -> Iterator[None]:
     """Keep squares and products of sums with sines and cosines as they are, within this context.
 
-    In a kinetic energy they are expanded, as cos² + sin² = 1 shortens it. In a potential, the square of the
-    distance of two points that are close together would become a small difference of large numbers.
+    So are sums of places that multiply velocities. In a kinetic energy all these are expanded, as
+    cos² + sin² = 1 shortens it. In a potential, the square of the distance of two points that are close
+    together would become a small difference of large numbers.
     """
     token = _apart.set(wanted)
     try:
@@ -48,8 +49,17 @@ def apart(wanted: bool = True) -> Iterator[None]:
         _apart.reset(token)
 
 
+#: The errors so far of the formula that is run, which it may have caught.
+raised: ContextVar[list[FormulaError] | None] = ContextVar("raised", default=None)
+
+
 class FormulaError(TypeError, ValueError):
     """A formula does something that recorded numbers cannot follow, or a name is wrong."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
+        if (errors := raised.get()) is not None:
+            errors.append(self)
 
 
 class Atom:
@@ -282,6 +292,9 @@ class Expr:
             a.function in meets or s.kind == "velocity" for a in moving for s in Expr.of(a).symbols()
         )
 
+    def _has_velocity(self) -> bool:
+        return any(s.kind == "velocity" for s in self.symbols())
+
     def _is_apart(self) -> bool:
         """Return whether only `apart` keeps the sum from being expanded."""
         with apart():
@@ -417,11 +430,15 @@ def _kept_product(first: Expr, second: Expr) -> Expr | None:
         return None
     if len(second.terms) > 1:
         (shared, rest), (more, other) = first._divided(), second._divided()
+        if rest._is_factor() != other._is_factor() and _apart.get():
+            return _over_velocities(*((first, second) if rest._is_factor() else (second, first)))
         if not (rest._is_factor() and other._is_factor()):
             return None
         base, factor = sorted((rest, other), key=lambda e: (len(e.text), e.text))
         return _with_factor(_as_factor(base), factor) * (Expr({shared: 1}) * Expr({more: 1}))
     (monomial,) = second.terms
+    if _apart.get() and first._is_factor() and second._has_velocity():
+        return _over_velocities(first, second)
     sums = [(a.argument, n) for a, n in monomial if a.argument is not None and a.function == "sum"]
     if not sums:
         return None
@@ -430,6 +447,22 @@ def _kept_product(first: Expr, second: Expr) -> Expr | None:
     if not joins and all(rest._ratio(e) is None for e, _ in sums):
         return None
     return _with_factor(second, rest) * Expr({shared: 1})
+
+
+def _over_velocities(places: Expr, others: Expr) -> Expr | None:
+    """Return a sum of places times others with velocities, term by term, or None if they have none."""
+    if not others._has_velocity():
+        return None
+    return _expanded(_whole(places), others)
+
+
+def _whole(expr: Expr) -> Expr:
+    """Return a sum as a factor, without what all its terms share, if `apart` keeps it."""
+    with apart():
+        if not expr._is_factor():
+            return expr
+    shared, rest = expr._divided()
+    return _as_factor(rest) * Expr({shared: 1})
 
 
 def _as_factor(expr: Expr) -> Expr:
@@ -619,7 +652,7 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
         return expr
     total = Expr({})
     for monomial, c in expr.terms.items():
-        product = Expr.of(c)
+        product, with_velocity = Expr.of(c), Expr({monomial: c})._has_velocity()
         for atom, n in monomial:
             if atom in values:
                 factor = values[atom]
@@ -629,8 +662,21 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
                 inner = substitute(atom.argument, values)
                 if atom.function != "sum":
                     factor = function_of(atom.function, inner)
-                else:  # it stays apart
-                    factor = _as_factor(inner) if inner._is_apart() else inner
+                else:
+                    factor = _whole(inner) if with_velocity or inner._is_apart() else inner
+            product = product * factor**n
+        total = total + product
+    return total
+
+
+def opened_squares(expr: Expr) -> Expr:
+    """Return the expression with the squares multiplied out that `apart` has kept."""
+    total = Expr({})
+    for monomial, c in expr.terms.items():
+        product = Expr.of(c)
+        for atom, n in monomial:
+            inner = atom.argument if atom.function == "sum" and n == 2 else None
+            factor = Expr.of(atom) if inner is None or not inner._is_apart() else inner
             product = product * factor**n
         total = total + product
     return total

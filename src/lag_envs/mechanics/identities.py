@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.mechanics.algebra import Atom, Expr, Monomial, function_of
+from lag_envs.mechanics.algebra import Atom, Expr, Monomial, function_of, opened_squares
 
 
 def apply_identities(expr: Expr) -> Expr:
@@ -27,6 +27,21 @@ def apply_identities(expr: Expr) -> Expr:
                     terms[monomial] = total
                 else:
                     terms.pop(monomial, None)
+
+
+def shorter(potential: Expr) -> Expr:
+    """Return a potential with its squares multiplied out if that leaves fewer terms that move.
+
+    It does by cos² + sin² = 1, as in the squared distance of two points, whose constant is of no account. It
+    is under a root, and there they stay.
+    """
+    opened = apply_identities(opened_squares(potential))
+    return opened if _moving(opened) < _moving(potential) else potential
+
+
+def _moving(expr: Expr) -> int:
+    """Return the number of terms that change with the motion."""
+    return sum(any(s.kind != "parameter" for a, _ in m for s in Expr.of(a).symbols()) for m in expr.terms)
 
 
 def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, int | Fraction]] | None:

@@ -15,8 +15,9 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from lag_envs.errors import hint
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, apart, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, apart, raised, substitute
 from lag_envs.mechanics.equations import Energies, place, velocity
+from lag_envs.mechanics.identities import shorter
 from lag_envs.mechanics.layout import SceneLayout
 
 #: The formulas of a scene and their arguments after ``self``.
@@ -194,9 +195,11 @@ def formula(scene: Any, name: str, fields: Sequence[str] | None = None) -> Itera
     fields : sequence of str, optional
         The fields that it may use, for one that is not run on recorded numbers.
     """
-    where = f"{type(scene).__name__}.{name}"
+    where, token = f"{type(scene).__name__}.{name}", raised.set([])
     try:
         yield
+        for error in raised.get() or ():
+            raise FormulaError(f"{error}; the formula catches this error, which it must not")
     except FormulaError as error:
         raise FormulaError(f"{where}: {error}") from error
     except dataclasses.FrozenInstanceError as error:
@@ -206,6 +209,8 @@ def formula(scene: Any, name: str, fields: Sequence[str] | None = None) -> Itera
         raise FormulaError(
             f"{where} fails{on} with {type(error).__name__}: {error}; {_remedy(scene, error, fields)}"
         ) from error
+    finally:
+        raised.reset(token)
 
 
 def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
@@ -295,8 +300,9 @@ def record_scene(scene: Any, layout: SceneLayout) -> Record:
 
     parts = {}
     for name in ("kinetic", "potential", "dissipation"):
-        with formula(scene, name), apart(name == "potential"):
+        with formula(scene, name), apart(name != "kinetic"):
             parts[name] = single_expression(run(name))
+    parts["potential"] = shorter(parts["potential"])
     with formula(scene, "applied"), apart():
         applied = _by_name(run("applied"), names, "coordinate")
     with formula(scene, "rests"):

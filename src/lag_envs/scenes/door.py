@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics import recording
-from lag_envs.mechanics.algebra import FormulaError, evaluate
+from lag_envs.mechanics.algebra import Expr, FormulaError, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import Exact, Numeric, exactly
 from lag_envs.mechanics.layout import SceneLayout, check_name
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import Record, Values, parameter_names
+from lag_envs.mechanics.recording import Values, parameter_names
 from lag_envs.scenes import picture
 from lag_envs.scenes.checks import shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
@@ -73,13 +73,13 @@ def admit(scene: Any, base: type) -> None:
     elif known is None:
         _check_names(scene, base)
         layout = layout_of(scene)
-        record = recording.record_scene(scene, layout)
-        recording.check_again(scene, layout, record)
-        _check_on_numbers(scene, layout, record)
+        recording.check_again(scene, layout, recording.record_scene(scene, layout))
+        _check_on_numbers(scene, scene.mechanics)
         _check_motion(scene, scene.mechanics)
         _check_bodies(scene)
         _admitted[type(scene)][key] = layout, scene.mechanics
     else:
+        _check_on_numbers(scene, scene.mechanics)
         _check_motion(scene, known[1])  # a parameter may have another sign
 
 
@@ -151,20 +151,20 @@ def _check_bodies(scene: Any) -> None:
         raise FormulaError(f"{of}.{error}") from error
 
 
-def _check_on_numbers(scene: Any, layout: SceneLayout, record: Record) -> None:
+def _check_on_numbers(scene: Any, found: Mechanics) -> None:
     """Raise a FormulaError if a formula gives something else on plain numbers than what was recorded.
 
-    It does if it asks for a parameter's type or text. It is tried at two points. A generous allowance is made
-    for rounding: where terms cancel in the record, plain numbers may leave a little.
+    It does if it asks for a parameter's type or text. It is tried at two points. An allowance is made for
+    rounding: where terms cancel in the record, plain numbers may leave a little.
     """
-    parameters = recording.parameter_values(scene)
-    rounding = 1e-9 * max([1.0, *map(abs, parameters.values())]) ** 2
-    names = [(name, x) for name, exprs in record.by_formula().items() for x in exprs]
+    layout, parameters = found.layout, recording.parameter_values(scene)
+    largest = max(map(abs, parameters.values()), default=0.0)
+    names = [(name, x) for name, exprs in found.record.by_formula().items() for x in exprs]
     alike: list[set[bool]] = [set() for _ in names]
     for first, step in ((0.37, 0.11), (1.3, -0.23)):
-        numbers = {name: first + step * i for i, name in enumerate(layout.names)}
+        numbers = {name: np.float64(first + step * i) for i, name in enumerate(layout.names)}
         rates = {name: 0.7 - x for name, x in numbers.items()}
-        controls = {name: 0.6 + step * i for i, name in enumerate(layout.controls)}
+        controls = {name: np.float64(0.6 + step * i) for i, name in enumerate(layout.controls)}
         values = exactly(parameters)
         for symbol, known in ((place, numbers), (velocity, rates), (recording.control, controls)):
             values |= {symbol(name): x for name, x in known.items()}
@@ -172,19 +172,24 @@ def _check_on_numbers(scene: Any, layout: SceneLayout, record: Record) -> None:
         u = Values("control", controls, dict.fromkeys(layout.absent, 0.0))
         try:
             with np.errstate(all="ignore"):
-                recorded = evaluate([x for _, x in names], values, Numeric)
-                found = _on_numbers(scene, q, v, u)
+                terms = [evaluate(_terms(x), values, Numeric) for _, x in names]
+                plain = _on_numbers(scene, q, v, u)
         except ArithmeticError:  # there it has no value
             continue
-        for outcomes, a, b in zip(alike, recorded, found, strict=True):
-            if math.isfinite(a) and math.isfinite(b):
-                outcomes.add(bool(abs(a - b) <= max(1e-3 * abs(a), rounding)))
+        for outcomes, parts, x in zip(alike, terms, plain, strict=True):
+            total, size = sum(parts), sum(map(abs, parts))
+            if not isinstance(x, complex) and math.isfinite(size) and math.isfinite(x):
+                outcomes.add(bool(abs(x - total) <= 1e-6 * size + 1e-15 * largest**2))
     for (name, _), outcomes in zip(names, alike, strict=True):
         if outcomes == {False}:
             raise FormulaError(
                 f"{type(scene).__name__}.{name} gives another result on plain numbers than on recorded ones; "
                 "it must not depend on the type or the text of a number"
             )
+
+
+def _terms(expr: Expr) -> list[Expr]:
+    return [Expr({monomial: c}) for monomial, c in expr.terms.items()]
 
 
 def _on_numbers(scene: Any, q: Values, v: Values, u: Values) -> list:

@@ -175,6 +175,9 @@ class TracedNumber:
             "is no parameter"
         )
 
+    def __str__(self) -> str:
+        raise FormulaError("a formula uses the text of a recorded number, which stands for any number")
+
     def __mod__(self, other: Any) -> NoReturn:
         raise FormulaError(
             "a formula that is compiled has no %, // or divmod(); a % b is a - b * xp.floor(a / b)"
@@ -234,8 +237,14 @@ class Trace:
     def record(self, op: str, *args: Any) -> Any:
         """Record an operation, or evaluate it if it needs no recording."""
         args = tuple(a if isinstance(a, TracedNumber | bool) else float(a) for a in args)
-        if not any(isinstance(a, TracedNumber) for a in args):
+        given = [a for a in args if isinstance(a, TracedNumber)]
+        if not given:
             return _FLOAT[op](*args)
+        if any(a.trace is not self for a in given):
+            raise FormulaError(
+                "a formula uses a number of an earlier call; it must keep none in a list, a dict or an "
+                "attribute: what was before a step is in `before`, and actions before it are hidden"
+            )
         args = self._as_numbers(op, args)
         simple = _simplify(op, args)
         if simple is not None:
