@@ -394,7 +394,7 @@ def _guarded(function, x):
         ({"reward": lambda self, *_: {"0.3": 1.0}.get(f"{self.scene.load_mass}", 0.0)}, "uses the text of"),
         (
             {"reward": lambda self, b, after, c, *_, last={"f": 0.0}: _difference(last, c.push)},
-            "uses a number of an earlier call; it must keep none in a list, a dict",
+            "uses a number of an earlier call; it must not keep numbers in a list",
         ),
         (
             {"reward": lambda self, b, after, *_: _guarded(math.acos, after.x)},

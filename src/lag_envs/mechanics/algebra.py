@@ -38,9 +38,9 @@ _apart: ContextVar[bool] = ContextVar("apart", default=False)
 def apart(wanted: bool = True) -> Iterator[None]:
     """Keep squares and products of sums with sines and cosines as they are, within this context.
 
-    So are sums of places that multiply velocities. In a kinetic energy all these are expanded, as
-    cos² + sin² = 1 shortens it. In a potential, the square of the distance of two points that are close
-    together would become a small difference of large numbers.
+    Also keep sums of places that multiply velocities. A kinetic energy is expanded, since cos² + sin² = 1
+    shortens it. Elsewhere, what depends on the distance of two points that are close together would become a
+    small difference of large numbers.
     """
     token = _apart.set(wanted)
     try:
@@ -280,7 +280,8 @@ class Expr:
     def _stays(self, exponent: int) -> bool:
         """Return whether this power of the sum is not expanded.
 
-        A square is expanded if terms of it may meet others: velocities, and by cos² + sin² = 1, see `apart`.
+        A square is expanded if its terms may combine with others: those with velocities, and, except within
+        `apart`, sines and cosines by cos² + sin² = 1.
         """
         if len(self.terms) < 2:
             return False

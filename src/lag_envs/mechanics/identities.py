@@ -32,8 +32,8 @@ def apply_identities(expr: Expr) -> Expr:
 def shorter(potential: Expr) -> Expr:
     """Return a potential with its squares multiplied out if that leaves fewer terms that move.
 
-    It does by cos² + sin² = 1, as in the squared distance of two points, whose constant is of no account. It
-    is under a root, and there they stay.
+    They may meet by cos² + sin² = 1, as in the squared distance of two points. Squares inside functions stay
+    whole: under a root the constant counts, and digits would be lost.
     """
     opened = apply_identities(opened_squares(potential))
     return opened if _moving(opened) < _moving(potential) else potential

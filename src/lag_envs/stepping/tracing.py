@@ -242,8 +242,8 @@ class Trace:
             return _FLOAT[op](*args)
         if any(a.trace is not self for a in given):
             raise FormulaError(
-                "a formula uses a number of an earlier call; it must keep none in a list, a dict or an "
-                "attribute: what was before a step is in `before`, and actions before it are hidden"
+                "a formula uses a number of an earlier call; it must not keep numbers in a list, a dict or "
+                "an attribute: the state before the step is `before`, and nothing else is remembered"
             )
         args = self._as_numbers(op, args)
         simple = _simplify(op, args)
