@@ -274,7 +274,7 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     steps = max((row["steps"][-1] for row in drifts if row["steps"]), default=0)
     return Content(
         title="What is conserved",
-        text=[TEXT[0].format(steps=steps), *TEXT[1:]][not steps :],
+        text=[*([TEXT[0].format(steps=steps)] if steps else []), *TEXT[1:]],
         tables=_tables(drifts, grown, balances),
         pictures=list(_pictures(drifts, grown)),
         claims=_claims([row for row in drifts if row["method"] == LAG_ENVS], grown, balances, steps),

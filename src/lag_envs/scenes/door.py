@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import Expr, FormulaError, evaluate
-from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.equations import Energies, place, velocity
 from lag_envs.mechanics.evaluation import Exact, Numeric, exactly
 from lag_envs.mechanics.layout import SceneLayout, check_name
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import Values, parameter_names
+from lag_envs.mechanics.recording import Record, Values, parameter_names
 from lag_envs.scenes import picture
 from lag_envs.scenes.checks import shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
@@ -194,15 +194,13 @@ def _terms(expr: Expr) -> list[Expr]:
 
 def _on_numbers(scene: Any, q: Values, v: Values, u: Values) -> list:
     """Return the results of the scene's formulas on plain numbers, in the order of `Record.exprs`."""
-    applied, rests, poses = scene.applied(q, v, u, Numeric), scene.rests(), scene.poses(q, Numeric)
-    return [
-        scene.kinetic(q, v, Numeric),
-        scene.potential(q, Numeric),
-        scene.dissipation(q, v, u, Numeric),
-        *(applied[name] for name in sorted(applied)),
-        *(rests[name] for name in sorted(rests)),
-        *(x for name in sorted(poses) for x in poses[name]),
-    ]
+    energies = Energies(
+        kinetic=scene.kinetic(q, v, Numeric),
+        potential=scene.potential(q, Numeric),
+        dissipation=scene.dissipation(q, v, u, Numeric),
+        applied=scene.applied(q, v, u, Numeric),
+    )
+    return Record(energies, scene.rests(), scene.poses(q, Numeric)).exprs()
 
 
 def _check_motion(scene: Any, found: Mechanics) -> None:
