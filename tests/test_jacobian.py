@@ -404,7 +404,17 @@ class Forced(Damped):
         return {"x1": -f * dx, "y1": -f * dy, "x2": f * dx, "y2": f * dy}
 
 
-@pytest.mark.parametrize("scene", [Damped(), Forced()], ids=["dissipation", "force"])
+class Inerter(Damped):
+    """A flywheel that the damper's rod turns."""
+
+    def kinetic(self, q, v, xp):
+        return super().kinetic(q, v, xp) + super().dissipation(q, v, None, xp)
+
+
+BETWEEN = pytest.mark.parametrize("scene", [kind() for kind in (Damped, Forced, Inerter)], ids=repr)
+
+
+@BETWEEN
 @pytest.mark.parametrize("gap", [1 / 8, 1 / 1024])
 def test_a_damper_does_not_depend_on_where_it_is(scene, gap):
     """Multiplied out, it was a small difference of squares of places."""
@@ -413,7 +423,7 @@ def test_a_damper_does_not_depend_on_where_it_is(scene, gap):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", [Damped(), Forced()], ids=["dissipation", "force"])
+@BETWEEN
 def test_nor_does_its_step(scene):
     near, far = (np.array([x, 0.3, x, -0.2, x + 1 / 8, 0.1, x + 1 / 16, 0.25]) for x in (0.0, 256.0))
     assert scene.step_bound(far, [], 0.02).substeps == scene.step_bound(near, [], 0.02).substeps == 1

@@ -18,6 +18,7 @@ from lag_envs.mechanics.algebra import (
     derivative,
     evaluate,
     function_of,
+    opened,
     substitute,
 )
 from lag_envs.mechanics.identities import apply_identities, shorter
@@ -157,7 +158,7 @@ def test_products_of_moving_sums_stay_factors():
 
 def test_sums_that_may_meet_others_are_multiplied_out():
     d, c, v = X - C, function_of("cos", X), Expr.of(Atom("velocity", "a"))
-    for a, b in ((1 + c, 2 + c), (1 + v, 2 + v), (1 + v, d), (1 + c, d), (1 + K, d), (1 + K, 2 + K)):
+    for a, b in ((1 + c, 2 + c), (1 + v, 2 + v), (1 + v, c - C), (1 + c, d), (1 + K, d), (1 + K, 2 + K)):
         assert len((a * b).terms) > 2 and (a * b).same(b * a)
     assert apply_identities((1 + c) * (1 - c) - 1).same(-c * c)
 
@@ -179,13 +180,16 @@ def test_sums_with_cosines_stay_factors_apart():
 
 
 def test_a_sum_of_places_stays_apart_from_velocities():
-    (v, w), d = (Expr.of(Atom("velocity", name)) for name in "ab"), X - Y
-    assert len((d * (v - w)).terms) == 4
+    """So do sines and cosines where they need not meet others."""
+    (v, w), d, waves = (Expr.of(Atom("velocity", name)) for name in "ab"), X - Y, function_of("cos", X) - C
+    assert len((waves * (v - w)).terms) == 4
     with apart():
-        assert len((d * (v - w)).terms) == 2 and len((d * v).terms) == 1
-        assert (d * (v - w)).same(d * v - d * w) and (2 * C * d * (v - w)).same((v - w) * (2 * C * d))
-        assert len(((X * d) * v).terms) == 1
-        product = d * (v - w)
+        product = waves * (v - w)
+        assert len(product.terms) == 2
+    assert len(substitute(product, {PLACES[1]: X}).terms) == 2
+    product = d * (v - w)
+    assert len(product.terms) == 2 and len((d * v).terms) == len(((X * d) * v).terms) == 1
+    assert product.same(d * v - d * w) and (2 * C * d * (v - w)).same((v - w) * (2 * C * d))
     assert len(substitute(product, {PLACES[0]: X + C}).terms) == 2
     assert substitute(product, {PLACES[0]: Y + C}).same(C * (v - w))
 
@@ -197,6 +201,17 @@ def test_squares_are_multiplied_out_where_that_is_shorter():
     assert len(square.terms) == 2
     assert shorter(square).same(2 - 2 * function_of("cos", X - Y))
     assert shorter(well).same(well) and shorter(function_of("sqrt", square)).same(function_of("sqrt", square))
+
+
+def test_a_kinetic_energy_takes_the_shorter_form():
+    """A sum of places stays if sine and cosine meet all the same, which depends on how rates are written."""
+    v, w = (Expr.of(Atom("velocity", name)) for name in "ab")
+    sin, cos = (function_of(name, Y) for name in ("sin", "cos"))
+    across, along = v * cos - (C + X) * w * sin, v * sin + (C + X) * w * cos
+    polar = v**2 + (C + X) ** 2 * w**2
+    assert apply_identities(shorter(across**2 + along**2)).same(polar)
+    along = v * sin + (C + X) * cos * w
+    assert shorter(across**2 + along**2).same(opened(polar)) and len(opened(polar).terms) == 4
 
 
 def test_roots_of_fourth_powers_are_squares():

@@ -38,9 +38,8 @@ _apart: ContextVar[bool] = ContextVar("apart", default=False)
 def apart(wanted: bool = True) -> Iterator[None]:
     """Keep squares and products of sums with sines and cosines as they are, within this context.
 
-    Also keep sums of places that multiply velocities. A kinetic energy is expanded, since cos² + sin² = 1
-    shortens it. Elsewhere, what depends on the distance of two points that are close together would become a
-    small difference of large numbers.
+    A kinetic energy is expanded, since cos² + sin² = 1 shortens it. Elsewhere, what depends on the distance
+    of two points that are close together would become a small difference of large numbers.
     """
     token = _apart.set(wanted)
     try:
@@ -423,7 +422,7 @@ def _kept_product(first: Expr, second: Expr) -> Expr | None:
 
     (x - c - 1)(x - c + 1)(x - c - 2) expanded would be a small difference of large numbers, as a power would.
     Sums with velocities, and usually with sines or cosines, are expanded (see `Expr._stays`), unless the
-    other operand already contains a power of the same sum.
+    other operand already contains a power of the same sum. A sum of places stays a factor of velocities.
     """
     if len(first.terms) < len(second.terms):
         first, second = second, first
@@ -431,14 +430,14 @@ def _kept_product(first: Expr, second: Expr) -> Expr | None:
         return None
     if len(second.terms) > 1:
         (shared, rest), (more, other) = first._divided(), second._divided()
-        if rest._is_factor() != other._is_factor() and _apart.get():
+        if rest._is_factor() != other._is_factor():
             return _over_velocities(*((first, second) if rest._is_factor() else (second, first)))
         if not (rest._is_factor() and other._is_factor()):
             return None
         base, factor = sorted((rest, other), key=lambda e: (len(e.text), e.text))
         return _with_factor(_as_factor(base), factor) * (Expr({shared: 1}) * Expr({more: 1}))
     (monomial,) = second.terms
-    if _apart.get() and first._is_factor() and second._has_velocity():
+    if first._is_factor() and second._has_velocity():
         return _over_velocities(first, second)
     sums = [(a.argument, n) for a, n in monomial if a.argument is not None and a.function == "sum"]
     if not sums:
@@ -670,16 +669,23 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
     return total
 
 
-def opened_squares(expr: Expr) -> Expr:
-    """Return the expression with the squares multiplied out that `apart` has kept."""
+def opened(expr: Expr) -> Expr:
+    """Return the expression with the sums multiplied out whose terms may combine with others.
+
+    These are factors of velocities, and the squares that `apart` has kept.
+    """
     total = Expr({})
     for monomial, c in expr.terms.items():
+        kept, with_velocity = [], Expr({monomial: c})._has_velocity()
         product = Expr.of(c)
         for atom, n in monomial:
-            inner = atom.argument if atom.function == "sum" and n == 2 else None
-            factor = Expr.of(atom) if inner is None or not inner._is_apart() else inner
-            product = product * factor**n
-        total = total + product
+            inner = atom.argument if atom.function == "sum" and 1 <= n <= 2 else None
+            if inner is not None and (with_velocity or (n == 2 and inner._is_apart())):
+                for _ in range(n):
+                    product = _expanded(product, inner)
+            else:
+                kept.append((atom, n))
+        total = total + _expanded(product, Expr({tuple(kept): 1}))
     return total
 
 

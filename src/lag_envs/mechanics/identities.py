@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
-from lag_envs.mechanics.algebra import Atom, Expr, Monomial, function_of, opened_squares
+from lag_envs.mechanics.algebra import Atom, Expr, Monomial, function_of, opened
 
 
 def apply_identities(expr: Expr) -> Expr:
@@ -29,14 +29,17 @@ def apply_identities(expr: Expr) -> Expr:
                     terms.pop(monomial, None)
 
 
-def shorter(potential: Expr) -> Expr:
-    """Return a potential with its squares multiplied out if that leaves fewer terms that move.
+def shorter(energy: Expr) -> Expr:
+    """Return an energy with its sums multiplied out if that leaves fewer terms that move.
 
-    They may meet by cos² + sin² = 1, as in the squared distance of two points. Squares inside functions stay
+    They may meet by cos² + sin² = 1, as in the squared distance of two points. Sums inside functions stay
     whole: under a root the constant counts, and digits would be lost.
     """
-    opened = apply_identities(opened_squares(potential))
-    return opened if _moving(opened) < _moving(potential) else potential
+    multiplied = opened(energy)
+    if multiplied.same(energy):
+        return energy
+    multiplied = apply_identities(multiplied)
+    return multiplied if _moving(multiplied) < _moving(apply_identities(energy)) else energy
 
 
 def _moving(expr: Expr) -> int:

@@ -302,7 +302,8 @@ def record_scene(scene: Any, layout: SceneLayout) -> Record:
     for name in ("kinetic", "potential", "dissipation"):
         with formula(scene, name), apart(name != "kinetic"):
             parts[name] = single_expression(run(name))
-    parts["potential"] = shorter(parts["potential"])
+    for name in ("kinetic", "potential"):
+        parts[name] = shorter(parts[name])
     with formula(scene, "applied"), apart():
         applied = _by_name(run("applied"), names, "coordinate")
     with formula(scene, "rests"):
