@@ -141,6 +141,7 @@ def test_report(task, file, tmp_path, monkeypatch):
     assert "Reach" in Path("out", "index.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow  # each part of it has quick tests of its own
 def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypatch, capsys):
     # Training: the worker knows the task by its file.
     runs = tmp_path / "runs"

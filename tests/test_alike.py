@@ -207,6 +207,7 @@ def test_at_least_half_of_the_policies(tmp_path):
     assert likeness(first, more, 1e-9).closeness < 1.0
 
 
+@pytest.mark.slow
 def test_other_architectures_may_act_alike(tmp_path):
     """Only the actions count."""
     plain = linear(tmp_path / "linear", arrays={0: LINEAR | {"gain": np.array([-0.5, -0.2, -0.3, 0.4])}})

@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering
+from covering import covering, slow
 from gymnasium.error import ResetNeeded
 from test_imperfections import ALL, ID
 
@@ -82,8 +82,9 @@ def test_a_batch_goes_on_with_the_same_bits(env_id, keywords, mode):
         go_on(envs, 1)
 
 
-def test_a_mask_sets_some_and_leaves_the_others():
-    envs = gym.make_vec(ID, num_envs=3, **ALL)
+@pytest.mark.parametrize("keywords", [{}, slow(ALL)], ids=["perfect", "all"])
+def test_a_mask_sets_some_and_leaves_the_others(keywords):
+    envs = gym.make_vec(ID, num_envs=3, **keywords)
     own, zero = envs.unwrapped, np.zeros((3, 1), np.float32)
     with pytest.raises(ResetNeeded, match="before get_state"):
         own.get_state()
