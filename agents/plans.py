@@ -33,7 +33,7 @@ def promising_controllers(env_id: str, seeds: Iterable[int], **changes: Any) -> 
         yield from islice(search(TASKS[env_id](), seed, **changes), PROMISING)
 
 
-def find_plans(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) -> None:
+def find_plans(env_id: str, folder: Path | None, seeds: Iterable[int]) -> None:
     """Find an environment's plans, and write them to the place where controllers read them, or into a folder.
 
     One plan is followed from any start: the one with the best mean return over fresh starts. The other is the

@@ -176,8 +176,7 @@ def _accuracy(task: Task) -> list[str]:
         whole = sum(bound.substeps == 1 for bound in found)
         lines += [
             f"Taylor series of order {found[0].order}, {found[0].kind}",
-            f"from extreme starts under the largest controls: {whole} of {len(found)} steps "
-            "certified as a "
+            f"from extreme starts under the largest controls: {whole} of {len(found)} steps certified as a "
             f"whole, {attempts} attempt{'s' if attempts > 1 else ''} at most",
             f"proved truncation error there: {largest:.1e} at most, in units of the state"
             if math.isfinite(largest)

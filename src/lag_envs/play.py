@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -23,11 +24,7 @@ DEAD = 0.12
 
 def keys_by_number(space: gym.Space) -> list[tuple[str, str]]:
     """Return the keys for each number of an action; controls beyond the pairs of keys stay at rest."""
-    if isinstance(space, gym.spaces.Discrete):
-        count = 1
-    else:
-        count = int(np.prod(space.shape or (0,)))
-    return list(PAIRS[:count])
+    return list(PAIRS[: math.prod(space.shape or ())])
 
 
 def pressed_action(
@@ -114,7 +111,7 @@ class Gamepad:
 
 def resting(task: Any) -> list[float]:
     """Return the action closest to controls of 0."""
-    return [float(number) for number in np.atleast_1d(task.rest_action)]
+    return np.atleast_1d(task.rest_action).astype(float).tolist()
 
 
 def help_of(task: Any, space: gym.Space) -> list[str]:

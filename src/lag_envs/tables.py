@@ -81,9 +81,13 @@ def rate_text(value: float) -> str:
     """
     for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= 0.9995 * size:
-            value /= size
-            return f"{value:.{max(0, 2 - (value >= 9.995) - (value >= 99.95))}f} {unit}"
+            return f"{three_digits(value / size)} {unit}"
     return f"{value:.0f}"
+
+
+def three_digits(value: float) -> str:
+    """Return a positive number with three digits, or all before the point."""
+    return f"{value:#.3g}".removesuffix(".") if value < 999.5 else f"{value:.0f}"
 
 
 def mean_with_error(mean: float, error: float, most: int = 6, exact: int = 4) -> str:

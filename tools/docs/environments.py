@@ -127,7 +127,7 @@ def overview(link: Callable[[str], str]) -> str:
             [
                 f"[{env_id}]({link(env_id)})",
                 first_line(type(task)),
-                "; ".join(_range(task, acting) for acting in task.formulas.acting),
+                "; ".join(_range(acting) for acting in task.formulas.acting),
                 *(
                     mean_with_error(row["mean"], row["error"]) if row else "not measured yet"
                     for row in map(found.get, ("random", best))
@@ -152,7 +152,7 @@ def by_scene(source: Callable[[str], str]) -> str:
     return markdown_table(["scene", "", "environments"], rows)
 
 
-def _range(task: Task, acting: Any) -> str:
+def _range(acting: Any) -> str:
     """Return a control's values in words."""
     if acting.values:
         return f"`{acting.control}` {', '.join(map(number_text, acting.values))} {acting.unit}"

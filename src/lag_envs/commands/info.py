@@ -34,14 +34,14 @@ def _line(id: str) -> tuple[str, ...]:
     task = TASKS[id]()
     return (
         id,
-        ", ".join(_range(task, acting) for acting in task.formulas.acting),
+        ", ".join(_range(acting) for acting in task.formulas.acting),
         f"{task.dt:g} s",
         f"{task.limit:g}",
         f"{task.duration:g} s",
     )
 
 
-def _range(task: Task, acting: Any) -> str:
+def _range(acting: Any) -> str:
     """Return a control's name, its range or choices, and its unit."""
     given = " or ".join(f"{value:g}" for value in acting.values) or f"{acting.low:g} to {acting.high:g}"
     return f"{acting.control} {given} {acting.unit}".rstrip()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lag_envs.controllers.basic import (
     Array,
     ObservationDecoder,
+    beginning,
     check_observation,
     check_single_control,
 )
@@ -95,9 +96,8 @@ class Filtered:
         batch = values.reshape(-1, values.shape[-1])
         x = np.tile(np.asarray(self.task.centre, np.float64), (len(batch), 1))
         covariance = np.tile(self.prior, (len(batch), 1, 1))
-        fresh, memory = np.ones(len(batch), np.bool_), None
+        fresh, memory = beginning(len(batch), state, episode_start), None
         if state is not None:
-            fresh = np.broadcast_to(False if episode_start is None else episode_start, len(batch))
             moved, spread = self._move(state)
             x, covariance = (
                 np.where(fresh[:, None], x, moved),

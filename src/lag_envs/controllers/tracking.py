@@ -172,7 +172,7 @@ def smoothed(task: Task) -> Task:
     return remade(task, **task.plans.smooth) if task.plans.smooth else task
 
 
-def waves(rng: np.random.Generator, n: int, steps: int, dt: float, count: int = 1) -> Array:
+def waves(rng: np.random.Generator, n: int, steps: int, dt: float, count: int) -> Array:
     """Return random actions (n, steps, count): sums of three sines of 0.5 to 3 Hz, clipped."""
     size, phase = rng.uniform(0.0, 1.0, (3, n, 1, count)), rng.uniform(0.0, 2.0 * np.pi, (3, n, 1, count))
     turn = 2.0 * np.pi * rng.uniform(0.5, 3.0, (3, n, 1, count)) * dt * np.arange(steps)[:, None]

@@ -144,7 +144,7 @@ class Model:
     def _control(self, state: Array, action: Array, target: Array) -> list[float]:
         """Return the controls that one action applies in a state."""
         formulas = self.task.formulas
-        if formulas.clipped:
+        if not formulas.choices:
             action = np.clip(action, -formulas.largest, formulas.largest)
         y = lifted(form_of(self.task.scene), state, np)
         return [float(u) for u in formulas.control(np, [*action], y, [*target], self._constants)]

@@ -68,7 +68,7 @@ class StyledShape(NamedTuple):
 
     shape: s.Line | s.Arrow
     style: Style
-    opacity: float = 1.0
+    opacity: float
 
 
 class Outline(NamedTuple):

@@ -177,7 +177,7 @@ class Program:
         self.clip = [
             f"{a} = select({a} < {-top}, {-top}, select({a} > {top}, {top}, {a}))"
             for a in self.a
-            if formulas.clipped
+            if not formulas.choices
         ]
         self.control = self.clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
         step = [*self.u, *self.g, *self.y, *self.z, *given]

@@ -303,7 +303,7 @@ class UnfusedProgram:
         actions = self._read(t, slice(0, formulas.actions), "a")
 
         def control(xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
-            if formulas.clipped:
+            if not formulas.choices:
                 top = formulas.largest
                 a = [xp.where(x < -top, -top, xp.where(x > top, top, x)) * k.strength for x in a]
             return formulas.control(xp, a, y, g, k)

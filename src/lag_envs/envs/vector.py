@@ -312,7 +312,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
             )
         self._over = over
         observations = observations.T
-        infos = self._infos(None) if self.diagnostics else {}
+        infos = self._infos(None)
         if self._over and self.autoreset_mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
         if self._seen:
@@ -577,7 +577,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         last |= {k: over & v for k, v in last.items() if k.startswith("_")}
         self._start(observations, over, False, False, False)
         self._over = 0
-        infos = self._infos(None) if self.diagnostics else {}
+        infos = self._infos(None)
         ends = {"final_obs": final, "_final_obs": over.copy(), "final_info": last, "_final_info": over.copy()}
         return observations, infos | ends
 

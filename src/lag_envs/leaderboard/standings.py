@@ -34,10 +34,8 @@ def page_data(board: Board) -> dict[str, Any]:
         for row in env["rows"]:
             middle, _ = shown_episodes(board.result(results[row["id"]]))
             submission = load(board.submission(row["id"]))
-            row["agent"], row["module"] = (
-                agent(submission.policies[middle][1]),
-                submission.architecture.module,
-            )
+            row["agent"] = agent(submission.policies[middle][1])
+            row["module"] = submission.architecture.module
     return data
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import numbers
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -374,13 +375,9 @@ class Expr:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         """Let NumPy's numbers be added and multiplied; refuse its functions and arrays."""
         operators: dict[str, Callable] = {
-            "add": lambda a, b: a + b,
-            "subtract": lambda a, b: a - b,
-            "multiply": lambda a, b: a * b,
-            "divide": lambda a, b: a / b,
-            "true_divide": lambda a, b: a / b,
-            "negative": lambda a: -a,
-        }
+            "add": operator.add, "subtract": operator.sub, "multiply": operator.mul,
+            "divide": operator.truediv, "negative": operator.neg,
+        }  # fmt: skip
         name = ufunc.__name__
         if method != "__call__" or name not in operators or options:
             known = callable(getattr(RecordedFunctions, name, None))

@@ -186,9 +186,7 @@ def _ends(problems: Problems, system: System, joints: Array, span: float) -> Arr
 # --- MuJoCo ---
 
 
-def xml(
-    system: System, integrator: str = "RK4", step: float = 0.02, gravity: Sequence[float] = (0, 0, 0)
-) -> str:
+def xml(system: System, gravity: Sequence[float], integrator: str = "RK4", step: float = 0.02) -> str:
     """Return MuJoCo's model of a system, contacts and constraints switched off."""
 
     def text(values: Sequence[float]) -> str:
@@ -230,7 +228,7 @@ class MuJoCoLinks(Engine):
         if not system.field:
             fields = fields[:1]
         models = [
-            mujoco.MjModel.from_xml_string(xml(system, self.method, dt * steps / n, field))
+            mujoco.MjModel.from_xml_string(xml(system, field, self.method, dt * steps / n))
             for field in fields
         ]
         data = mujoco.MjData(models[0])
@@ -250,7 +248,7 @@ def mujoco_motion(system: System, q: Array, v: Array, control: float) -> tuple[A
     """Return MuJoCo's mass matrix and accelerations for given joint positions and velocities."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(xml(system, gravity=system.fields(np.array([control]))[0]))
+    model = mujoco.MjModel.from_xml_string(xml(system, system.fields(np.array([control]))[0]))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, system.forces(np.array([control]))[0]
     mujoco.mj_forward(model, data)

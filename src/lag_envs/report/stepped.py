@@ -42,14 +42,6 @@ class Stepped:
         self.flow: Flow = form.flow(dt) if flow is None else flow
         self.angle, self.width = form.angle, form.width
 
-    def constants(self) -> dict[str, float]:
-        """Return the arguments of a step."""
-        return motion_constants_of(self.scene)
-
-    def numbers(self) -> SimpleNamespace:
-        """Return the arguments by attribute."""
-        return SimpleNamespace(**self.constants())
-
     def lift(self, state: ArrayLike) -> tuple:
         """Return the lifted state."""
         return self.form.lift(state)
@@ -68,7 +60,7 @@ class Stepped:
 
     def at(self, state: ArrayLike, u: Any) -> tuple[list, Any]:
         """Return the flow's variables and coefficients at a state under a control."""
-        y, k = self.lift(np.asarray(state, np.float64)), self.numbers()
+        y, k = self.lift(np.asarray(state, np.float64)), SimpleNamespace(**motion_constants_of(self.scene))
         return self.unpack(y, u, k), self.drive(y, u, k, np)
 
     def largest_majorant(self, dt: float) -> float:
@@ -77,8 +69,8 @@ class Stepped:
 
     def stepper(self) -> Stepper:
         """Return the code of a step, without the constants that are zero."""
-        return Stepper(self.form, self.flow, absent_from(self.constants()))
+        return Stepper(self.form, self.flow, absent_from(motion_constants_of(self.scene)))
 
     def present(self) -> list[float]:
         """Return the constants of the code."""
-        return [value for value in self.constants().values() if value != 0.0]
+        return [value for value in motion_constants_of(self.scene).values() if value != 0.0]

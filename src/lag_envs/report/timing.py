@@ -67,10 +67,10 @@ class FlowSteps:
             raise ValueError(f"compiled for the constants {self._names}, got {present}")
         return (dt, self.stepped.largest_majorant(dt), *(float(constants[name]) for name in present))
 
-    @cached_property
+    @property
     def simulate(self) -> Callable:
         """``simulate(trajectory, controls, dt, x, constants...)``, as called by `Scene.simulate`."""
-        return self._code.compile_simulate()
+        return self._code.simulation
 
     def end(self, case: Case, dt: float, steps: int) -> Array:
         """Return the state after some steps with the control held; NaN if a step was refused."""

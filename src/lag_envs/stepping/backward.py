@@ -74,15 +74,7 @@ class Backward(Series):
 
     def _find_reached(self) -> list[int]:
         """Return the nodes that g depends on, also through the arguments of functions."""
-        pending = [*self.record.force, *(node for node, _, _ in self.record.mass.values())]
-        found: set[int] = set()
-        while pending:
-            n = pending.pop()
-            if n >= 0 and n not in found:
-                found.add(n)
-                node = self.record.nodes[n]
-                pending += node.args[:1] if node.op in FUNCTIONS else node.args
-        return sorted(found)
+        return self._reach(lambda args: args[:1])
 
     def _plan_back(self, n: int, node: Node) -> None:
         def plan(i: int, kind: str, other: int) -> None:

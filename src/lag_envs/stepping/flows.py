@@ -257,7 +257,7 @@ class Stepper:
         return compile_lines("advance", self.arguments, body, self.engine())
 
     @cache  # noqa: B019 - steppers are kept anyway
-    def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...] = ()) -> Callable:
+    def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...]) -> Callable:
         """Compile ``jacobian(states, controls, out, dt, x, constants...)``.
 
         It fills ``out[i]`` with the derivatives of the state after step i with respect to state, controls and
@@ -377,11 +377,7 @@ class Stepper:
 
     @cached_property
     def simulation(self) -> Callable:
-        """The function that `compile_simulate` makes."""
-        return self.compile_simulate()
-
-    def compile_simulate(self) -> Callable:
-        """Compile ``simulate(trajectory, controls, dt, x, constants...)``.
+        """``simulate(trajectory, controls, dt, x, constants...)``.
 
         It fills the trajectory's rows from the second on, and returns the row whose step was refused, or 0.
         """

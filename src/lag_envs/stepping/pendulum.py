@@ -121,7 +121,7 @@ def rotate(c: Any, s: Any, angle: Any, polynomial: Callable = polynomial) -> tup
     return c + (c * less - s * sine), s + (s * less + c * sine)
 
 
-def step_change(omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order: int = ORDER) -> tuple:
+def step_change(omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order: int) -> tuple:
     """Return the changes of θ and hθ' in one step of the series, and (cosθ, sinθ) after it."""
     W, _ = taylor_coefficients(omega * h, c, s, scaled(coeffs, h), order)
     change = pairwise_sum(W[1:])

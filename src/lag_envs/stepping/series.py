@@ -151,6 +151,10 @@ class Series:
     # --- which series are kept -----------------------------------------------------------------------------
 
     def _find_live(self) -> list[int]:
+        return self._reach(lambda args: args[1:] if len(args) > 2 else args)
+
+    def _reach(self, through: Callable[[Sequence[int]], Sequence[int]]) -> list[int]:
+        """Return the nodes that g depends on; `through` chooses among the arguments of functions."""
         found: set[int] = set()
         pending = [*self.record.force, *(node for node, _, _ in self.record.mass.values())]
         while pending:
@@ -158,7 +162,7 @@ class Series:
             if n >= 0 and n not in found:
                 found.add(n)
                 node = self.record.nodes[n]
-                pending += node.args[1:] if node.op in FUNCTIONS and len(node.args) > 2 else node.args
+                pending += through(node.args) if node.op in FUNCTIONS else node.args
         return sorted(found)
 
     def _slot(self, kind: str, i: int) -> int:

@@ -157,7 +157,6 @@ class TaskFormulas:
                 f"{self._of}.action mixes lists of values with ranges; "
                 "give every control a list, or every control a range"
             )
-        self.clipped = not self.choices
         #: The action of the largest control.
         self.largest = float(task.largest_action)
         if not 0.0 < self.largest < math.inf:

@@ -24,6 +24,7 @@ from lag_envs import store
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import driving
 from lag_envs.leaderboard.site.scenery import Scenery, page_json, scenery_data
+from lag_envs.tables import rate_text, three_digits
 
 #: Lists the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
@@ -417,15 +418,7 @@ def count_text(value: Any) -> str:
     """
     if not isinstance(value, int | float):
         return "–"
-    for size, sign in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= 0.9995 * size:
-            return f"{_three(value / size)}\N{NO-BREAK SPACE}{sign}"
-    return f"{value:.0f}"
-
-
-def _three(value: float) -> str:
-    """Return a positive number with three digits, or all before the point."""
-    return f"{value:#.3g}".removesuffix(".") if value < 999.5 else f"{value:.0f}"
+    return rate_text(value).replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def duration(value: Any) -> str:
@@ -440,8 +433,8 @@ def duration(value: Any) -> str:
         return "–"
     for size, sign in ((3600.0, "h"), (60.0, "min")):
         if value >= size:
-            return f"{_three(value / size)}\N{NO-BREAK SPACE}{sign}"
-    return f"{_three(value)}\N{NO-BREAK SPACE}s"
+            return f"{three_digits(value / size)}\N{NO-BREAK SPACE}{sign}"
+    return f"{three_digits(value)}\N{NO-BREAK SPACE}s"
 
 
 def seconds(value: Any) -> str:

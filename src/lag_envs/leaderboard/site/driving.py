@@ -146,7 +146,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
             slider = {"name": name, "unit": unit, "at": at, "value": values[name]}
             found.append(slider | ({"looks": looks} if looks[0] != looks[-1] else {}))
     acting = task.formulas.acting
-    if task.formulas.clipped and acting and all(a.low == -a.high for a in acting):
+    if not task.formulas.choices and acting and all(a.low == -a.high for a in acting):
         limit = {"name": "control limit", "at": names.index("strength"), "value": 1.0}
         if len(acting) == 1:
             found.append(limit | {"shown": acting[0].high, "unit": acting[0].unit})
