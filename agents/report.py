@@ -224,7 +224,7 @@ def _behaviour(env_id: str) -> list[str]:
     def cell(values: Sequence[float | None]) -> str:
         there = [value for value in values if value is not None]
         ends = (
-            f"{value:.3g}" if value >= 1e-3 or value == 0.0 else "< 0.001"
+            f"{float(f'{value:.3g}'):,g}" if value >= 1e-3 or value == 0.0 else "< 0.001"
             for value in ((min(there), max(there)) if there else ())
         )
         return " to ".join(dict.fromkeys(ends)) or "never"
@@ -249,7 +249,7 @@ def _real_time(env_id: str) -> list[str]:
     found, told = stored(REAL_TIME), []
     for name, row in found.get("envs", {}).get(env_id, {}).items():
         ms = {what: f"{1e3 * row[what]:.3g} ms" for what in ("interval", "median", "p99", "longest")}
-        late = f"{row['late']:.2%}" if row["late"] else "none"
+        late = f"{100 * row['late']:.2g} %" if row["late"] else "none"
         text = (
             f"In {found['clocked']} episodes by the clock, a call of {name} took {ms['median']} (median),"
             f" {ms['p99']} (99 %) and {ms['longest']} (longest); {late} exceeded the interval of"
@@ -257,9 +257,9 @@ def _real_time(env_id: str) -> list[str]:
         )
         if row["allowed"] is not None:
             text += (
-                f" In real time its plans are made {1e3 * row['allowed']:g} ms ahead, in a process of their"
-                f" own. That costs {plus_minus(*row['loss'])} of the return, measured in {found['episodes']}"
-                f" other episodes, and leaves {plus_minus(*row['return'])}."
+                f" In real time its plans are made {1e3 * row['allowed']:g} ms ahead, in a separate"
+                f" process. That costs {plus_minus(*row['loss'])} of the return, measured in"
+                f" {found['episodes']} other episodes, and leaves {plus_minus(*row['return'])}."
             )
         told.append(text)
     return ["**In real time** (`python -m agents.real_time`). " + " ".join(told)] if told else []

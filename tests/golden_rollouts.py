@@ -114,11 +114,13 @@ class Roll:
         half the share, with the opposite sign.
         """
         space: Any = self.envs.single_action_space if self._mode else self.envs.action_space
-        if isinstance(space, gym.spaces.Discrete):
-            places = np.floor((0.5 + 0.5 * np.clip(actions, -1.0, 1.0)) * space.n).astype(np.int64)
-            given = np.minimum(places, space.n - 1)
-        else:
+        if isinstance(space, gym.spaces.Box):
             given = actions[:, None] * np.resize(np.float32([1.0, -0.5]), space.shape) * space.high
+        else:
+            n = space.n if isinstance(space, gym.spaces.Discrete) else space.nvec
+            shares = actions[:, None] * np.resize([1.0, -0.5], np.shape(n)) if np.shape(n) else actions
+            places = np.floor((0.5 + 0.5 * np.clip(shares, -1.0, 1.0)) * n).astype(np.int64)
+            given = np.minimum(places, n - 1)
         return self._seen(*self.envs.step(given if self._mode else given[0]))
 
     def _seen(self, observations, rewards, terminated, truncated, infos) -> dict[str, Any]:  # type: ignore

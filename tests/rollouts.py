@@ -56,10 +56,17 @@ def actions(steps, *shape, seed=0):
     found = np.select([temper == 0, temper == 1], [noise, swings], 2.0 * noise).astype(np.float32)
     if space is None:
         return found
-    if isinstance(space, gym.spaces.Box):
+    if space.dtype == np.float32:
         return found * space.high
-    choices = space.n if isinstance(space, gym.spaces.Discrete) else space.nvec
+    choices = numbers_of_choices(space)
     return np.minimum((0.5 * np.clip(found, -1.0, 1.0) + 0.5) * choices, choices - 1).astype(np.int64)
+
+
+def numbers_of_choices(space):
+    """Return how many choices each entry of an action has; those of a batch are boxes of whole numbers."""
+    if isinstance(space, gym.spaces.Box):
+        return space.high + 1
+    return space.n if isinstance(space, gym.spaces.Discrete) else space.nvec
 
 
 def nothing(env):

@@ -123,9 +123,9 @@ def test_action_table(env_id, page):
     assert tuple(found) == tuple(env.task.action)
     assert {row["Unit"] for row in found.values()} <= set(env.scene.control_units)
     if env.task.formulas.choices:
-        (text,) = (row["Values, by action"] for row in found.values())
-        columns = [[float(value)] for value in text.split(", ")]
-        actions = [space.dtype.type(i) for i in range(space.n)]
+        lists = [row["Values, by action"].split(", ") for row in found.values()]
+        columns = [[float(value) for value in column] for column in zip(*lists, strict=False)]
+        actions = [np.full(space.shape, i, space.dtype)[()] for i in range(len(columns))]
     else:
         top = f"{env.task.largest_action:g}"
         columns = [[float(row[f"At {sign}{top}"]) for row in found.values()] for sign in ("-", "")]

@@ -169,6 +169,10 @@ UNTRACEABLE = {
         "dissipation; absolute value",
     ),
     "unknown function": ({"potential": lambda self, q, xp: xp.erf(q.x)}, "potential; xp.erf; xp.sin, cos"),
+    "function of others": (
+        {"potential": lambda self, q, xp: xp.cosh(q.x)},
+        "potential; xp.cosh; write (xp.exp(x) + xp.exp(-x)) / 2",
+    ),
     "fractional power": (
         {"potential": lambda self, q, xp: q.x**1.5},
         "potential; power; xp.exp(p * xp.log(x))",

@@ -14,29 +14,24 @@ from covering import every, slow
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter, parameter_names
-from lag_envs.scenes import symbolic
-from lag_envs.scenes.acrobot import Acrobot
+from lag_envs.scenes import SCENES, symbolic
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
-from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
 from lag_envs.scenes.derivation import form_of
-from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar
-from lag_envs.scenes.rotary_pendulum import RotaryPendulum
-from lag_envs.scenes.two_link_arm import TwoLinkArm
 from lag_envs.stepping.general import series_code_of
 
-PACKAGE = [
-    (PivotedBar, {}),
-    (PivotedBar, {"track": None}),
-    *((Incline, {"control": mode}) for mode in Incline.modes),
-    *((CylinderInCylinder, {"control": mode}) for mode in CylinderInCylinder.modes),
-    (CartPole, {}),
-    *((Acrobot, {"control": mode}) for mode in Acrobot.modes),
-    *((Chain, {"bars": n}) for n in (1, 2, 3)),
-    (RotaryPendulum, {}),
-    (TwoLinkArm, {}),
-]
+
+def variants(scene):
+    """Return the keywords with which a scene has different equations."""
+    if scene is Chain:
+        return [{"bars": n} for n in (1, 2, 3)]
+    if scene is PivotedBar:
+        return [{}, {"track": None}]
+    return [{"control": mode} for mode in getattr(scene, "modes", ())] or [{}]
+
+
+PACKAGE = [(scene, keywords) for scene in SCENES for keywords in variants(scene)]
 CASES = [*PACKAGE, *((scene, {}) for scene in contract_scenes.ALL)]
 SLOW = [(Chain, {"bars": n}) for n in (4, 5, 6)]
 IDS = ["-".join([s.__name__, *(f"{v}" for v in k.values())]) for s, k in [*CASES, *SLOW]]
@@ -292,6 +287,7 @@ FORMS = {
     "CylinderInCylinder-damping": "Coefficients",
     "CylinderInCylinder-tilt": "Coefficients",
     "Chain-1": "Coefficients",
+    "Pendulum": "Coefficients",
 }
 
 

@@ -370,6 +370,18 @@ def _guarded(function, x):
         ({"observe": lambda self, after, target, xp: {"x": after.y}}, "there is no entry of the state 'y'"),
         ({"reward": lambda self, *_: None}, "reward returns None"),
         (
+            {"reward": lambda self, b, after, c, t, dt, xp: xp.clip(after.x, 0.0, 1.0)},
+            r"it uses xp.clip; .* write xp.minimum\(xp.maximum\(x, low\), high\)",
+        ),
+        (
+            {"reward": lambda self, b, after, c, t, dt, xp: xp.where(after.x > 0.0, 1.0)},
+            "give xp.where all its arguments",
+        ),
+        (
+            {"reward": lambda self, b, after, c, t, dt, xp: self.target["there"]},
+            "KeyError: 'there'; look up only what is there; state, controls and target are arguments",
+        ),
+        (
             {"reward": lambda self, after: 0.0},
             r"reward must be reward\(self, before, .*, got \(self, after\)",
         ),
@@ -421,7 +433,10 @@ def _guarded(function, x):
             {"usable": {"load_mass": (1.0, 0.1)}},
             r"usable\['load_mass'\] must be .*, in this order, got \(1.0, 0.1",
         ),
-        ({"interval": 0.0}, "Mistaken.interval must lie between 1e-6 and 1 s, got 0 s"),
+        (
+            {"interval": 0.0},
+            "Mistaken.interval must lie between 1e-6 and 1 s, got 0 s; .* another unit of time",
+        ),
         (
             {"steps": 0},
             r"duration \(Mistaken.steps \* Mistaken.interval\) must be at least dt=0.05 s, got 0 s",

@@ -127,7 +127,7 @@ def test_a_process_needs_a_file_that_can_be_imported(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("from lag_envs.workers import Elsewhere\nElsewhere(1)\n")
     ended = subprocess.run([sys.executable, script], capture_output=True, text=True)
-    assert ended.returncode == 1 and "RuntimeError: no process could be started; a script" in ended.stderr
+    assert ended.returncode == 1 and "no process could be started: save the script" in ended.stderr
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from covering import covering, slow
+from own_tasks import Crane, Deliver
 from pictures import IDS, TASKS, length, moment, picture, shown
 from rollouts import SINGLE
 
@@ -103,6 +104,23 @@ def test_target_is_where_it_was_set():
     task = TASKS[incline.Tilt.id]
     (mark,) = (s for s in task.shapes(moment(task, target=0.3, state=[0.0, 0.0, 0.0])) if s.role == "target")
     assert mark == Circle((0.3, 0.05), 0.05, "target")
+
+
+def test_a_window_holds_what_starts_reach():
+    class Shown(Crane):
+        def bodies(self):
+            return {"trolley": [Circle((0.0, 0.0), 0.1, "body")], "load": [Circle((0.0, 0.0), 0.1, "body")]}
+
+        def poses(self, q, xp):
+            load = (q.x + q.rope * xp.sin(q.swing), -q.rope * xp.cos(q.swing), q.swing)
+            return {"trolley": (q.x, 0.0, 0.0), "load": load}
+
+    class Hoist(Deliver):
+        scene = Shown
+
+    view = Hoist().window()  # ropes are 1.2 m long at most
+    assert view.frame == "trolley" and 1.2 < view.right < 1.6
+    assert Shown().window().right < 0.3  # a scene knows no starts
 
 
 def test_a_task_adds_shapes_where_frames_are():

@@ -271,7 +271,7 @@ def test_what_takes_too_long_is_not_run(monkeypatch):
     monkeypatch.setattr(work_precision, "LIMIT", 0.0)
     monkeypatch.setattr(work_precision, "QUICK", {"one step": work_precision.QUICK["one step"]})
     rows = list(work_precision.variant_points("PivotedBar", "scipy", quick=True))
-    assert rows and all(row["problem"].startswith("not run, it would take") for row in rows)
+    assert rows and all(row["problem"].startswith("not run: it would take") for row in rows)
     assert len({(row["mode"], row["method"]) for row in rows}) == len(rows)
 
 

@@ -23,6 +23,7 @@ from reference import (
     random_cases,
     scales,
 )
+from rollouts import numbers_of_choices
 from scipy.integrate import solve_ivp
 
 from lag_envs import scenes
@@ -673,7 +674,7 @@ def test_against_dop853(kind):
 def random_action(env, rng, size=1.0):
     """Return an action of an environment, as a share of the largest if it lies in a range."""
     if env.task.formulas.choices:
-        return rng.integers(env.action_space.n)
+        return rng.integers(numbers_of_choices(env.action_space))
     return env.action_space.high * rng.uniform(-size, size, env.action_space.shape)
 
 

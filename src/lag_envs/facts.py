@@ -178,10 +178,9 @@ def _accuracy(task: Task) -> list[str]:
             f"Taylor series of order {found[0].order}, {found[0].kind}",
             f"from extreme starts under the largest controls: {whole} of {len(found)} steps certified as a "
             f"whole, {attempts} attempt{'s' if attempts > 1 else ''} at most",
-            f"proved truncation error there: {largest:.1e} at most, in units of the state"
-            if math.isfinite(largest)
-            else "",
         ]
+        if math.isfinite(largest):
+            lines += [f"proved truncation error there: {largest:.1e} at most, in units of the state"]
     speed = task.certified_speed()
     if speed is not None and speed >= 0.0:
         shown, rate = math.floor(10.0 * speed) / 10.0, f"{layout_of(scene).free[0]}_dot"

@@ -61,14 +61,14 @@ def number_text(value: float) -> str:
 
     Examples
     --------
-    >>> [number_text(x) for x in (0.02, 1e-06, 100000.0, 1e9, 3.14159265, math.inf, -0.0)]
-    ['0.02', '1e-6', '100000', '1e9', '3.1416', '∞', '0']
+    >>> [number_text(x) for x in (0.02, 1e-06, 100000.0, 210000.0, 1e9, 3.14159265, math.inf, -0.0)]
+    ['0.02', '1e-6', '100000', '2.1e5', '1e9', '3.1416', '∞', '0']
     """
     if math.isinf(value):
         return "∞" if value > 0.0 else "-∞"
-    return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value + 0.0:.5g}").replace(
-        "1e5", "100000"
-    )
+    if abs(value) == 1e5:
+        return f"{value:.0f}"
+    return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value + 0.0:.5g}")
 
 
 def rate_text(value: float) -> str:
@@ -102,8 +102,8 @@ def mean_with_error(mean: float, error: float, most: int = 6, exact: int = 4) ->
 
     Examples
     --------
-    >>> mean_with_error(418.987, 0.0117), mean_with_error(0.000165, 0.0)
-    ('418.987 ± 0.012', '0.0002 ± 0.0000')
+    >>> mean_with_error(418.987, 0.0117), mean_with_error(0.000165, 0.0), mean_with_error(-1e-5, 0.0)
+    ('418.987 ± 0.012', '0.0002 ± 0.0000', '0.0000 ± 0.0000')
     """
     digits = exact if error <= 0.0 else min(most, max(0, 1 - math.floor(math.log10(error))))
-    return f"{mean:.{digits}f} ± {error:.{digits}f}"
+    return f"{mean:z.{digits}f} ± {error:.{digits}f}"

@@ -126,8 +126,8 @@ class Elsewhere:
             self._pool.submit(int).result()
         except BrokenProcessPool as error:
             raise RuntimeError(
-                "no process could be started; a script that starts one has its own commands below "
-                'if __name__ == "__main__":, and is a file'
+                "no process could be started: save the script as a file, and put its commands under "
+                'if __name__ == "__main__":'
             ) from error
 
     def call(self, method: str, *args: Any) -> Future:

@@ -265,7 +265,7 @@ def actions_for(task: Task, controls: Array) -> NDArray:
 def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
     """Return (scale, offset) that turn controls into the numbers of actions, as in `actions_for`.
 
-    Among listed controls c, the nearest to u has the largest 2 c u - c².
+    Among listed controls c, the one nearest to u has the largest 2 c u - c².
     """
     if formulas.choices:
         (acting,) = formulas.acting

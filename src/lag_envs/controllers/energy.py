@@ -77,8 +77,8 @@ class PivotEnergyLQR(Pumped):
         The pivot's acceleration per missing energy, relative to the energy between both rests.
     centring : float
         Stiffness with which the pivot is drawn to its middle [1/s²].
-    catch, lose, at, weights, effort
-        See `Pumped`.
+    **regulator
+        Arguments of `Pumped`.
 
     References
     ----------

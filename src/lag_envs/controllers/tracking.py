@@ -105,7 +105,7 @@ class Tracking(Clocked):
         )
 
     def mirrored(self) -> Tracking:
-        """Return the plan's mirror image, for a task that looks the same from behind."""
+        """Return the plan's mirror image, for a task that is symmetric under reflection."""
         return Tracking(
             self.task, states=-self.states, actions=2.0 * self.idle - self.actions, gains=self.gains,
             rest=-self.rest, hold=self.hold,

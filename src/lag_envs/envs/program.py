@@ -213,8 +213,8 @@ class Program:
     def step_one(self) -> Callable:
         """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the rows `held` written.
 
-        These are the controls of a step that the fast formula does not cover, or that was refused. The action
-        is a number if it has one entry, else an array.
+        Those rows hold the controls of a step that the fast formula does not cover, or that was refused. The
+        action is a number if it has one entry, else an array.
         """
         body = [
             *self._constants_one(), *self._one.load([*self.y, *self.g, *self.reached, "n"]),

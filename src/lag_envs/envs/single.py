@@ -178,8 +178,8 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
         Parameters
         ----------
-        action : array_like, shape (1,)
-            The action; a finite value outside its space is clipped.
+        action : array_like, shape (n_actions,), or int
+            The action, an int where values are listed; a finite number outside a range is clipped.
 
         Returns
         -------
@@ -189,7 +189,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Raises
         ------
         ValueError
-            For an action that is not finite, not real or not of shape (1,).
+            For an action that is not finite, not real, not listed or of another shape.
         ResetNeeded
             Before the first reset, and after termination.
         StepRefused

@@ -262,8 +262,8 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
 
         Parameters
         ----------
-        actions : array_like, shape (num_envs, 1)
-            Actions; finite values outside their space are clipped.
+        actions : array_like, shape (num_envs, n_actions), or (num_envs,) where one list of values is given
+            Actions, ints where values are listed; finite numbers outside a range are clipped.
 
         Returns
         -------

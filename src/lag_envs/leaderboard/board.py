@@ -319,7 +319,7 @@ class Board:
 
         Returns
         -------
-        list of Entry
+        list of BoardEntry
             Submissions that it still has to be compared with. If there are any, nothing is kept.
         """
         alike = alike or {}

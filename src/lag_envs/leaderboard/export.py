@@ -453,7 +453,7 @@ def export(
         seed = result.get("seed", getattr(model, "seed", None))
         seed = number if seed is None or int(seed) in arrays else int(seed)
         if seed in arrays:
-            raise ExportError(f"{source.model}: there is another model of seed {seed}")
+            raise ExportError(f"{source.model}: another model has seed {seed} too")
         tables.append(table)
         arrays[seed] = content
         off = max(off, one)

@@ -28,6 +28,19 @@ Monomial = tuple[tuple["Atom", int], ...]
 
 #: A product of two sums that would have more terms than this stays a product.
 LARGEST_PRODUCT = 4096
+#: What to write instead of functions that formulas lack.
+INSTEAD = {
+    "arcsin": "xp.atan(x / xp.sqrt(1 - x * x))",
+    "arctan2": "xp.atan(y / x) where x is positive",
+    "clip": "xp.minimum(xp.maximum(x, low), high)",
+    "cosh": "(xp.exp(x) + xp.exp(-x)) / 2",
+    "hypot": "xp.sqrt(x * x + y * y)",
+    "log10": "xp.log(x) / xp.log(10)",
+    "sign": "xp.where(x < 0, -1.0, 1.0)",
+    "sinh": "(xp.exp(x) - xp.exp(-x)) / 2",
+    "square": "x * x",
+}
+INSTEAD |= {"asin": INSTEAD["arcsin"], "atan2": INSTEAD["arctan2"]}
 #: The remedy for a branch on a number.
 BRANCH = "where the form differs, branch on a field that is no parameter, such as `spring: bool = True`"
 
@@ -586,14 +599,11 @@ class RecordedFunctions:
         return function_of("sin", x) / function_of("cos", x)
 
     def __getattr__(self, name: str) -> Any:
-        raise FormulaError(
-            f"a formula uses xp.{name}; an energy has xp.sin, cos, tan, atan, tanh, sqrt, exp, log and pi"
-            + (
-                ": it must be smooth"
-                if name in ("where", "abs", "sign", "minimum", "maximum", "floor")
-                else ""
-            )
-        )
+        remedy = f": write {INSTEAD[name]}" if name in INSTEAD else ""
+        if name in ("where", "abs", "sign", "minimum", "maximum", "floor", "clip"):
+            remedy = ": it must be smooth"
+        known = "xp.sin, cos, tan, atan, tanh, sqrt, exp, log and pi"
+        raise FormulaError(f"a formula uses xp.{name}; an energy has {known}{remedy}")
 
 
 # --- calculus -----------------------------------------------------------------------------------------------

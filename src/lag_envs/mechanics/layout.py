@@ -197,8 +197,8 @@ def make_layout(
     for name in results:
         if results.count(name) > 1:
             raise FormulaError(
-                f"{of}: two of the forces and ratios are named {name!r}; rename one in reactions or ratios "
-                "(drive_s is the force that moves a coordinate s which reactions does not name)"
+                f"{of}: two forces or ratios are named {name!r}; rename one in reactions or ratios "
+                "(drive_s is the force on a coordinate s that reactions does not name)"
             )
     return layout
 

@@ -219,6 +219,10 @@ def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
         return f"write xp.{of_numpy[1]}, and functions of xp only"
     if isinstance(error, RecursionError):
         return "a formula calls itself without end"
+    if isinstance(error, KeyError):
+        return "look up only what is there; state, controls and target are arguments"
+    if of_xp := re.search(r"Trace\.(\w+)\(\) missing", str(error)):
+        return f"give xp.{of_xp[1]} all its arguments, as for NumPy's"
     owner = getattr(error, "obj", None)
     ours = owner is not None and type(owner) in (type(of), type(getattr(of, "scene", None)))
     if not isinstance(error, AttributeError) or not ours:

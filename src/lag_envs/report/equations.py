@@ -113,7 +113,7 @@ class NormalFormEquation(Equation):
 
 
 class Problems:
-    """Some cases on one kind of scene as arrays, a column for each.
+    """Several cases on one kind of scene, as arrays with a column for each.
 
     Parameters
     ----------

@@ -280,7 +280,7 @@ def point(
         few = cases if together else cases[:1]
         expected = _seconds(rival, few, dt, steps, together) * len(cases) / len(few)
         if expected > LIMIT:
-            raise TimeoutError(f"not run, it would take {expected:.0f} s")
+            raise TimeoutError(f"not run: it would take {expected:.0f} s")
     ends = rival.build(Problems(cases), dt, steps, together).end()[: len(some)]
     known = np.where(np.isnan(ends), np.nan, ends)  # NaN has many bit patterns
     row = state_errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}

@@ -62,6 +62,9 @@ def complete(cls: type) -> None:
             sys.modules[cls.__module__] = ModuleType(cls.__module__)
         try:
             dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        except ValueError as error:  # a mutable default
+            what, remedy = str(error).partition(":")[0], "give a tuple, or a constant without annotation"
+            raise FormulaError(f"{cls.__name__}: {what}; {remedy}") from error
         finally:
             if absent:
                 del sys.modules[cls.__module__]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
@@ -234,29 +235,29 @@ def places(scene: Scene, now: Frame) -> dict[str, Any]:
     return q | turned | places
 
 
-def window(scene: Scene) -> Window:
-    """Return a window that follows the first body and contains the others' reach."""
-    size, first = 1.15 * _reach(scene), next(iter(scene.mechanics.record.poses), "")
+def window(scene: Scene, lengths: Mapping[str, float] = MappingProxyType({})) -> Window:
+    """Return a window that follows the first body and contains the others' reach.
+
+    It is as wide as if all lengths were at most as large as the bodies, or as given by name.
+    """
+    size, first = 1.15 * _reach(scene, tuple(lengths.items())), next(iter(scene.mechanics.record.poses), "")
     return Window(-size, -size, size, size, first)
 
 
 @lru_cache(maxsize=256)
-def _reach(scene: Scene) -> float:
+def _reach(scene: Scene, given: tuple[tuple[str, float], ...]) -> float:
     """Return the largest distance of any body's outline from the first body, over all angles [m].
 
-    A coordinate that occurs in the poses only in sines and cosines counts as an angle, any other as a length,
-    which is followed as far as the bodies are large.
+    A coordinate that occurs in the poses only in sines and cosines counts as an angle, any other as a length.
     """
-    names, record = layout_of(scene).names, scene.mechanics.record.poses
+    names, record, longest = layout_of(scene).names, scene.mechanics.record.poses, dict(given)
     sizes = {body: extent(outline) for body, outline in scene.bodies().items() if body in record}
     lengths = {s.name for x, y, *_ in record.values() for s in _plain(x) | _plain(y)}
     generator, far = np.random.default_rng(5), 0.0
     scale = max(sizes.values(), default=1.0) or 1.0
+    ends = {n: max(scale, longest.get(n, 0.0)) if n in lengths else math.pi for n in names}
     for _ in range(256):
-        q = {
-            n: generator.uniform(-scale, scale) if n in lengths else generator.uniform(-math.pi, math.pi)
-            for n in names
-        }
+        q = {n: generator.uniform(-end, end) for n, end in ends.items()}
         found = scene.poses(Values("coordinate", q), Numeric)
         x, y, *_ = next(iter(found.values()), (0.0, 0.0, 0.0))
         for body, pose in found.items():

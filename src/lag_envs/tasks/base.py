@@ -222,7 +222,10 @@ class Task:
         self.dt = interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
             name = f"{of}.interval" if dt is None else "dt"
-            raise ValueError(f"{name} must lie between 1e-6 and 1 s, got {self.dt:g} s")
+            raise ValueError(
+                f"{name} must lie between 1e-6 and 1 s, got {self.dt:g} s; for other motions write "
+                "all numbers of scene and task in another unit of time"
+            )
         steps = check_number(f"{of}.steps", self.steps, endless=True)
         if steps != math.inf and steps % 1.0:
             raise ValueError(f"{of}.steps must be a whole number, or infinity for no end, got {steps:g}")
@@ -511,8 +514,11 @@ class Task:
         return dict(self.scene.indicators(now, xp))
 
     def window(self) -> Window:
-        """Return the part of the plane to look at [m]."""
-        return self.scene.window()
+        """Return the part of the plane to look at [m]: by default, as far as bodies reach from the starts."""
+        if type(self.scene).window is not Scene.window:
+            return self.scene.window()
+        starts = self.formulas.starts.items()
+        return picture.window(self.scene, {name: abs(centre) + half for name, (centre, half) in starts})
 
     def shapes(self, now: Frame) -> list[Shape]:
         """Return the visible shapes at a moment, from back to front."""

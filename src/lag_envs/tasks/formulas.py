@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.errors import warn_of_misspelt
-from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.algebra import INSTEAD, FormulaError
 from lag_envs.mechanics.recording import ARGUMENTS, Values, displaced, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of
@@ -315,9 +315,10 @@ class TaskFormulas:
                         raise FormulaError(f"after.{hidden} {why}") from error
                 if not isinstance(error.obj, ElementaryTrace):
                     raise
+                instead = f": write {INSTEAD[error.name]}" if error.name in INSTEAD else ""
                 raise FormulaError(
                     f"it uses xp.{error.name}; a task's formula has xp.sin, cos, tan, atan, tanh, sqrt, exp, "
-                    "log, where, abs, minimum, maximum, floor and pi"
+                    f"log, where, abs, minimum, maximum, floor and pi{instead}"
                 ) from error
             for key, value in vars(task).items():
                 kept = isinstance(getattr(type(task), key, None), cached_property)
@@ -416,7 +417,9 @@ class TaskFormulas:
         """Return the observation."""
         found = self._call("observe", k, self.named_state(y, k), self.named_targets(g), self._known(xp, y))
         if not isinstance(found, Mapping) or not found:
-            raise FormulaError(f"{self._of}.observe must return numbers by name, in order, got {found!r:.60}")
+            got = "nothing" if not found else f"a {type(found).__name__}"
+            wanted = 'numbers by name, as in {"x": after.x}'
+            raise FormulaError(f"{self._of}.observe must return {wanted}, got {got}")
         return [_counted(value) for value in found.values()]
 
     def _recorded(self) -> tuple[tuple[str, ...], str]:

@@ -23,7 +23,7 @@ class DerivedConstants:
     """The constants that depend on the drawn parameters, and the lines that compute them.
 
     They are computed with twice the digits, from drawn and other parameters, and rounded once. So an
-    environment has the same bits as one made with these values.
+    environment gives the same bits as one made with these values.
     """
 
     def __init__(self, task: Task, absent: frozenset[str]) -> None:
