@@ -174,6 +174,37 @@ def test_ghosts_run_beside(drive, haunted):
     until(page, "document.activeElement.className === 'stage'")
 
 
+#: Keeps a file from being loaded until the test wants it.
+HOLD = """() => {
+    document.head.append = (script) => (window.held = script);
+}"""
+
+
+def test_a_ghost_that_comes_late_or_never(drive, haunted):
+    """Choosing one pauses the drive; nothing starts before it is there."""
+    page = drive(cylinder_in_cylinder.Tilt.id, folder=haunted, slowly=True)
+    page.evaluate(HOLD)
+    page.focus(".stage")
+    page.keyboard.down("ArrowRight")
+    until(page, "parseFloat(document.querySelector('.driver .readout dd').textContent) > 0.1")
+    page.select_option(".drive-controls select >> nth=1", "live:0")
+    assert message(page) == "Loading the ghost …"
+    assert page.text_content(".go") == "Resume" and page.evaluate("document.querySelector('.go').disabled")
+    assert link_of(page)
+    page.keyboard.press("Space")
+    assert page.text_content(".go") == "Resume"
+    page.evaluate("window.held.dispatchEvent(new Event('error'))")
+    until(page, "document.querySelector('.message').textContent.startsWith('The ghost could not be loaded')")
+    assert page.evaluate("document.querySelectorAll('.drive-controls select')[1].value") == ""
+    page.click(".go")
+    until(page, "document.querySelector('.go').textContent === 'Pause'")
+    page.select_option(".drive-controls select >> nth=1", "live:0")
+    page.evaluate("document.documentElement.append(window.held)")
+    until(page, "document.querySelector('.message').textContent.includes('starts')")
+    assert page.text_content(".go") == "Start" and reading(page, "Time") == "0.00 s"
+    assert reading(page, "Ghost's return") == "0.00"
+
+
 class Everything(TwoLists):
     """Two controls from lists, noise, hidden parameters, a delay."""
 

@@ -11,11 +11,15 @@ const nameOf = (key) => NAMES[key] ?? key.toUpperCase();
 /** Keys that act as others while these drive nothing themselves. */
 const ALIASES = { a: "ArrowLeft", d: "ArrowRight", s: "ArrowDown", w: "ArrowUp" };
 
+/** Where an event's key is on the keyboard; those on a screen have no place. */
+const placeOf = ({ code, key }) => code || key.toLowerCase();
+
 /** Keys, pointer and gamepad as numbers per control. */
 class Hands {
   constructor(about, lost) {
     [this.about, this.lost] = [about, lost];
-    this.pressed = new Set();
+    /** Keys by their place on the keyboard: what a key is called may change while it is held, as with Shift. */
+    this.pressed = new Map();
     [this.pointer, this.finger] = [null, null];
     this.pad = null;
     this.held = {};
@@ -29,6 +33,35 @@ class Hands {
   keyOf({ key }) {
     const small = key.length === 1 ? key.toLowerCase() : key;
     return this.pairs.flat().includes(small) ? small : ALIASES[small] ?? small;
+  }
+
+  press(event) {
+    const place = placeOf(event);
+    if (this.pressed.get(place)?.held) return;
+    this.pressed.set(place, { key: this.keyOf(event), held: true, read: false });
+  }
+
+  /** While one drives, a key that is let go before a step has read it still acts on the next one. */
+  lift(event, driving) {
+    const pressed = this.pressed.get(placeOf(event));
+    if (!pressed) return;
+    pressed.held = false;
+    if (pressed.read || !driving) this.pressed.delete(placeOf(event));
+  }
+
+  /** Whether a key acts. */
+  presses(key) {
+    return [...this.pressed.values()].some((pressed) => pressed.key === key);
+  }
+
+  /** The numbers for a step. */
+  read() {
+    const numbers = this.numbers();
+    for (const [place, pressed] of this.pressed) {
+      pressed.read = true;
+      if (!pressed.held) this.pressed.delete(place);
+    }
+    return numbers;
   }
 
   /** Whether nobody drives: no key, pointer or stick is held. */
@@ -78,8 +111,8 @@ class Hands {
     const { controls, levels, largest, rest } = this.about;
     return controls.map(({ values }, i) => {
       const many = values.length;
-      const [down, up] = (PAIRS[i] ?? []).map((key) => this.pressed.has(key));
-      const digit = many ? values.findIndex((_, j) => this.pressed.has(String(j + 1))) : -1;
+      const [down, up] = (PAIRS[i] ?? []).map((key) => this.presses(key));
+      const digit = many ? values.findIndex((_, j) => this.presses(String(j + 1))) : -1;
       if (digit >= 0) return digit;
       let share = null;
       if (down || up) share = up - down;
@@ -260,20 +293,26 @@ function open(root, board, code, tools) {
     return `${name}${start === undefined ? "" : `, seed ${start}`}, return ${text(total, 2)}`;
   }
 
+  /** Whether the chosen ghost is still to come; until then nothing starts, because a ghost begins the drive anew. */
+  const loading = () => Boolean(ghostSelect.value && !ghost);
+
   async function chooseGhost() {
-    const [kind, row] = ghostSelect.value.split(":");
     const asked = ghostSelect.value;
+    const [kind, row] = asked.split(":");
+    if (running) pause();
     episodeLabel.hidden = true;
     ghost = null;
     if (kind) {
-      let found;
-      try {
-        found = await GHOSTS[kind](Number(row));
-      } catch (error) {
-        tell(String(error.message));
+      label();
+      tell("Loading the ghost …");
+      const found = await GHOSTS[kind](Number(row)).catch(() => null);
+      if (ghostSelect.value !== asked) return;
+      if (!found) {
+        dismissGhost();
+        label();
+        tell("The ghost could not be loaded. Choose it again when you are online.");
         return;
       }
-      if (ghostSelect.value !== asked) return;
       ghost = found;
       if (ghost.replays) {
         episodeSelect.replaceChildren(...ghost.replays.map((replay, i) => option(String(i), seeded(replay))));
@@ -283,8 +322,7 @@ function open(root, board, code, tools) {
       }
       if (ghost.seed !== undefined) seed = ghost.seed;
     }
-    restart();
-    tell(starting(how), starting(heard));
+    beginAnew();
     if (ghost?.act) warmUp();
   }
 
@@ -292,8 +330,8 @@ function open(root, board, code, tools) {
     ghost.replay = ghost.replays[Number(episodeSelect.value)] ?? ghost.replays[0];
     const start = ghost.replay.reset_seed;
     if (start !== undefined) seed = big(start);
-    restart();
-    tell(start === undefined ? "The seed of this episode is not known: the ghost starts elsewhere." : starting(how), starting(heard));
+    beginAnew();
+    if (start === undefined) tell("The seed of this episode is not known: the ghost starts elsewhere.", starting(heard));
   }
 
   function startGhost() {
@@ -353,6 +391,15 @@ function open(root, board, code, tools) {
     show(1);
   }
 
+  /** Stop, go back to the start, and let the player begin. */
+  function beginAnew() {
+    running = false;
+    rerunning = null;
+    hands.release();
+    restart();
+    tell(starting(how), starting(heard));
+  }
+
   /**
    * Play on a trial episode in the browser's idle time. A browser runs new code slowly at first, up to a hundred
    * times, and compiles what it has often run; so a drive begins at full speed.
@@ -375,7 +422,7 @@ function open(root, board, code, tools) {
   }
 
   function tick() {
-    const key = rerunning ? rerunning.keys[me.steps] : hands.numbers();
+    const key = rerunning ? rerunning.keys[me.steps] : hands.read();
     if (!key) {
       close("The link's keys end here");
       return;
@@ -445,11 +492,12 @@ function open(root, board, code, tools) {
 
   function label() {
     stage.toggleAttribute("data-driving", running);
+    for (const starts of [go, again, fresh]) starts.disabled = loading();
     go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
   }
 
   function run() {
-    if (running) return;
+    if (running || loading()) return;
     running = true;
     tapped = null;
     note();
@@ -580,7 +628,9 @@ function open(root, board, code, tools) {
 
   /** Recompute a link's drive, a little in each frame, and tell whether its claim is true. */
   function checkLink(hash) {
-    linked = rerunning = null;
+    if (rerunning) beginAnew();
+    else if (running) pause();
+    linked = null;
     watch.hidden = true;
     if (ghostSelect.value.startsWith("link:")) dismissGhost();
     listGhosts();
@@ -626,7 +676,7 @@ function open(root, board, code, tools) {
         ghostSelect.value = "link:0";
         chooseGhost();
       } else {
-        restart();
+        beginAnew();
       }
     };
     go();
@@ -654,10 +704,7 @@ function open(root, board, code, tools) {
     }
     stage.focus();
     seed = big(match[1]);
-    running = false;
-    rerunning = null;
-    restart();
-    tell(starting(how), starting(heard));
+    beginAnew();
   }
 
   // --- what people do
@@ -670,14 +717,14 @@ function open(root, board, code, tools) {
     const key = hands.keyOf(event);
     const drives = hands.pairs.flat().includes(key) || (/^[1-9]$/.test(key) && about.controls.some((c) => c.values.length));
     if (drives) {
-      hands.pressed.add(key);
-      if (!running && !ended()) run();
+      hands.press(event);
+      if (!running && !ended() && !event.repeat) run();
     } else if (key in acts) {
       if (!event.repeat) acts[key]();
     } else if (!running || !key.startsWith("Arrow")) return; // while one drives, arrows do not scroll the page
     event.preventDefault();
   });
-  stage.addEventListener("keyup", (event) => hands.pressed.delete(hands.keyOf(event)));
+  stage.addEventListener("keyup", (event) => hands.lift(event, running && !rerunning));
   stage.addEventListener("blur", () => hands.release());
 
   function afresh() {
@@ -769,15 +816,8 @@ function open(root, board, code, tools) {
     select.addEventListener("change", () => pointed && stage.focus({ preventScroll: true }));
   }
   speed.addEventListener("change", () => (before = performance.now()));
-  ghostSelect.addEventListener("change", () => {
-    running = false;
-    rerunning = null;
-    chooseGhost();
-  });
-  episodeSelect.addEventListener("change", () => {
-    running = false;
-    chooseEpisode();
-  });
+  ghostSelect.addEventListener("change", chooseGhost);
+  episodeSelect.addEventListener("change", chooseEpisode);
   link.addEventListener("focus", () => link.select());
   copy.addEventListener("click", async () => {
     link.select();
