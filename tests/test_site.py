@@ -17,7 +17,7 @@ from lag_envs.leaderboard.site.build import render, write_page
 from lag_envs.leaderboard.site.driving import sliders
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
 from lag_envs.scenes.picture import Picture
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum
+from lag_envs.tasks import TASKS, acrobot, cylinder_in_cylinder, incline, pendulum
 from tests import board_pages
 from tests.board_pages import HOSTILE, clean
 
@@ -332,7 +332,19 @@ def test_contrast(theme):
             cylinder_in_cylinder.Tilt,
             ["mass", "shell_radius", "radius", "damping", "gravity", "control limit"],
         ),
+        # Without rotor inertia the gear ratio has no effect.
+        (
+            acrobot.AcrobotExact,
+            ["mass_1", "mass_2", "length_1", "length_2", "inertia_1", "inertia_2", "gravity"],
+        ),
     ],
 )
 def test_parameters_that_the_script_follows_have_sliders(kind, names):
     assert [slider["name"] for slider in sliders(kind, Unfused(kind()))] == names
+
+
+@pytest.mark.slow
+def test_a_plain_number_has_no_unit():
+    kind = acrobot.AcrobotReal
+    units = {slider["name"]: slider["unit"] for slider in sliders(kind, Unfused(kind()))}
+    assert units["gear_ratio"] == "" and units["gravity"] == "m/s²"

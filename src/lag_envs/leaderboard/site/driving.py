@@ -123,9 +123,10 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
 def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     """Return the parameters that may be changed while driving.
 
-    Only parameters for which the changed script steps like an environment made with the changed value: Python
-    code beyond the formulas' arithmetic does not reach the script. The effect on the picture is given at
-    `MARKS`. The limit of the controls is a factor, `shown` in units of the only control or in per cent.
+    Only parameters that have an effect, and for which the changed script steps like an environment made with
+    the changed value: Python code beyond the formulas' arithmetic does not reach the script. The effect on the
+    picture is given at `MARKS`. The limit of the controls is a factor, `shown` in units of the only control or
+    in per cent.
     """
     task, program = env.task, env.program
     names, fields = list(program.given), type(task.scene).__dataclass_fields__
@@ -142,9 +143,11 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     for name, others in marked.items():
         if together or _follows(env, {name: values[name]}):
             looks = [_look(other) for other in others]
-            unit, at = fields[name].metadata["unit"], names.index(f"self_{name}")
-            slider = {"name": name, "unit": unit, "at": at, "value": values[name]}
-            found.append(slider | ({"looks": looks} if looks[0] != looks[-1] else {}))
+            seen = looks[0] != looks[-1]
+            if seen or _acts(env, name, MARKS[-1] * values[name]):
+                unit, at = fields[name].metadata["unit"], names.index(f"self_{name}")
+                slider = {"name": name, "unit": "" if unit == "1" else unit, "at": at, "value": values[name]}
+                found.append(slider | ({"looks": looks} if seen else {}))
     acting = task.formulas.acting
     if not task.formulas.choices and acting and all(a.low == -a.high for a in acting):
         limit = {"name": "control limit", "at": names.index("strength"), "value": 1.0}
@@ -167,6 +170,15 @@ def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
     """Return whether a script with changed parameters does the same as tasks made with them."""
     others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
     return bool(others) and all(_steps_as(env, list(values), other) for other in others)
+
+
+def _acts(env: Unfused, name: str, value: float) -> bool:
+    """Return whether the step reads a parameter, or a constant that changes with it."""
+    changed = Unfused(env.task, env.program)
+    changed.set_parameter(name, value)
+    step = env.program.python.partition("def start(")[2]  # what comes before computes the constants
+    pairs = zip(env.program.constants, changed.constants, strict=True)
+    return any(a != b and f"k[{i}]" in step for i, (a, b) in enumerate(pairs))
 
 
 def _look(task: Task) -> dict[str, Any]:

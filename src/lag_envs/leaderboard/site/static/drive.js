@@ -590,7 +590,7 @@ function open(root, board, code, tools) {
     const name = slider.name.replace(/^com_/, "centre-of-mass ").replace(/_/g, " ");
     const say = () => {
       const value = slider.value * 2 ** Number(input.value);
-      output.textContent = `${+(value * (slider.shown ?? 1)).toPrecision(3)} ${slider.unit}`;
+      output.textContent = `${+(value * (slider.shown ?? 1)).toPrecision(3)} ${slider.unit}`.trim();
       input.setAttribute("aria-valuetext", output.textContent);
       return value;
     };
