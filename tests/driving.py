@@ -45,6 +45,12 @@ ROLLOUT = """async ([program, code, episodes]) => {
 }"""
 
 
+#: Keeps files from being loaded; the last is window.held.
+HOLD = """() => {
+    document.head.append = (script) => (window.held = script);
+}"""
+
+
 def hex_of(x):
     return struct.pack(">d", x).hex()
 

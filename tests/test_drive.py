@@ -5,6 +5,7 @@ import pytest
 from browsers import serious, until
 from covering import slow
 from driving import (
+    HOLD,
     bare_pages,  # noqa: F401
     driver_page,  # noqa: F401
     haunted_page,  # noqa: F401
@@ -111,7 +112,8 @@ def link():
 
 
 def test_a_link_is_recomputed_in_the_page(drive, link):
-    page = drive(link.id, replay.write_link(link))
+    encoded = replay.write_link(link).replace("=", "%3D").replace("~", "%7E")
+    page = drive(link.id, encoded)
     until(page, "document.querySelector('.verdict').textContent.startsWith('The link is true')")
     assert page.evaluate("document.querySelector('.drive-controls select option:checked') !== null")
     # Watching it leads to the same return; it is the driver's ghost.
@@ -224,7 +226,7 @@ def test_another_link_or_seed_may_follow_a_link(drive, link):
     assert replay.read_link(link_of(page)).seed == 9
 
 
-#: Invalid links, whole or as changes of a valid one; and the page's messages.
+#: Invalid links and seeds, whole or as changes of a valid one; and the page's messages.
 IMPOSSIBLE = [
     ({"step": "00000000"}, "another version"),
     ("#drive=1~x", "damaged"),
@@ -238,12 +240,14 @@ IMPOSSIBLE = [
     slow({"claimed": -np.inf}, "not a finite number"),
     slow({"claimed": -0.0}, "claims a return of −0, but"),
     slow({"keys": "gAECB"}, "forged"),
-    slow("#seed=99999999999999999999", "below 2"),
+    slow("#seed=99999999999999999999", "must be a whole number from 0 to 2⁶⁴ − 1"),
+    slow("#seed=-1", "must be a whole number from 0 to 2⁶⁴ − 1"),
+    ("#seed=7&x=1", "must be a whole number from 0 to 2⁶⁴ − 1; this start is a random one."),
 ]
 
 
 @pytest.mark.parametrize(("made", "told"), IMPOSSIBLE)
-def test_an_impossible_link_is_explained(drive, link, made, told):
+def test_an_impossible_link_or_seed_is_explained(drive, link, made, told):
     hash = made if isinstance(made, str) else replay.write_link(link._replace(**made))
     page = drive(link.id, hash)
     until(page, f"document.querySelector('.verdict').textContent.includes({told!r})")
@@ -422,7 +426,7 @@ def test_two_controls_without_a_picture(drive, owned):
 
 def test_choices(drive, owned):
     page = drive("OwnSwitched-v0", folder=owned, slowly=True)
-    assert "1 to 3 for one of the listed actions" in message(page)
+    assert ", or 1 for −5 m/s², 2 for 0 m/s², 3 for 5 m/s²; or hold" in message(page)
     page.keyboard.down("ArrowLeft")
     shows(page, "d²s/dt²", "−5.00 m/s²")
     assert reading(page, "θ₁").endswith(" rad") and reading(page, "dθ₁/dt").endswith(" rad/s")
@@ -450,6 +454,19 @@ def test_what_the_browser_lacks_is_told(browsing, bare):
     status = "document.querySelector('#drive .status').textContent"
     until(page, f"{status}.includes('lacks what driving needs: drawing')")
     assert not page.evaluate("document.querySelector('.begin').disabled")
+    page.reload()
+    page.evaluate(HOLD)
+    page.click(".begin")
+    page.evaluate("window.held.dispatchEvent(new Event('error'))")
+    until(page, f"{status} === 'The program could not be loaded. Check the connection and try again.'")
+    page.evaluate("delete document.head.append")
+    page.evaluate("delete Math.fround")
+    page.click(".begin")
+    until(page, f"{status}.includes('from the end of 2020 on')")
+    assert page.is_enabled(".begin") and page.evaluate("document.querySelector('.stage') === null")
+    page.add_init_script("delete Element.prototype.replaceChildren")
+    page.reload()
+    until(page, f"{status}.includes('from the end of 2020 on')")
 
 
 def test_names_for_those_who_do_not_see(drive):

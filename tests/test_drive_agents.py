@@ -8,6 +8,7 @@ from browsers import serious, until
 from covering import size
 from driven import at_random
 from driving import (
+    HOLD,
     LINEAR,
     bare_pages,  # noqa: F401
     check_bits,
@@ -172,12 +173,6 @@ def test_ghosts_run_beside(drive, haunted):
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
     until(page, "document.activeElement.className === 'stage'")
-
-
-#: Keeps a file from being loaded until the test wants it.
-HOLD = """() => {
-    document.head.append = (script) => (window.held = script);
-}"""
 
 
 def test_a_ghost_that_comes_late_or_never(drive, haunted):

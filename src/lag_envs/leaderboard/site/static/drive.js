@@ -132,6 +132,7 @@ const WARM = 300;
 const TAP = 10;
 const idly = globalThis.requestIdleCallback?.bind(globalThis) ?? ((work) => setTimeout(work, 20));
 
+/** What driving needs and old browsers lack. */
 const LACKING = [
   ["64-bit integers (BigInt)", typeof BigInt === "function"],
   ["drawing (canvas)", typeof CanvasRenderingContext2D === "function"],
@@ -156,7 +157,7 @@ function scaled(a, b, share) {
 
 /** Build the driver into an element and return it. */
 function open(root, board, code, tools) {
-  const { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, calm } = tools;
+  const { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, hash, calm } = tools;
   const { about } = code;
   const known = board.known && board.known.best !== board.known.random ? board.known : null;
   const scoreOf = (total) => (total - known.random) / (known.best - known.random);
@@ -193,9 +194,12 @@ function open(root, board, code, tools) {
     if (running) pause();
     tell("The gamepad is disconnected. Drive with the keys, or connect it again; Space continues.");
   });
-  const lists = about.controls.map(({ values }) => values.length).filter(Boolean);
-  const meant = lists.length > 1 ? "the action with that number in each list" : "one of the listed actions";
-  const listed = lists.length ? `, or 1 to ${Math.min(Math.max(...lists), 9)} for ${meant}` : "";
+  const short = (x) => text(x, Number.isInteger(x) ? 0 : 2);
+  const valueOf = ({ unit }, x) => `${short(x)} ${unit}`.trim();
+  const lists = about.controls.filter(({ values }) => values.length);
+  const digits = Math.min(Math.max(...lists.map(({ values }) => values.length)), 9);
+  const listed = lists.length > 1 ? `, or 1 to ${digits} for the action with that number in each list`
+    : lists.map((one) => `, or ${one.values.slice(0, digits).map((x, i) => `${i + 1} for ${valueOf(one, x)}`).join(", ")}`).join("");
   /** The keys and what they control, to be read or to be heard. */
   const described = (keys, name, unitOf) => hands.pairs
     .map((pair, i) => {
@@ -203,7 +207,6 @@ function open(root, board, code, tools) {
       return `${keys(pair)} ${[meaning, name(about.controls[i])].filter(Boolean).join(" ")}${unit && unitOf(unit)}`;
     })
     .join(", ") + listed;
-  const short = (x) => text(x, Number.isInteger(x) ? 0 : 2);
   const words = ({ name }) => name.replace(/_/g, " ");
   const letter = (control) => (control.meaning && symbol(control.name) === words(control) ? "" : symbol(control.name));
   const how = described((pair) => pair.map(nameOf).join(" "), letter, (unit) => ` [${unit}]`);
@@ -215,7 +218,8 @@ function open(root, board, code, tools) {
   const touched = matchMedia("(hover: none)").matches;
   // Without a key the first of listed actions acts, which may push too.
   const unasked = about.controls
-    .map(({ name, unit, values }, i) => (values[about.rest[i]] ? ` Without a ${touched ? "touch" : "key"}, ${symbol(name)} is ${short(values[about.rest[i]])} ${unit}.` : ""))
+    .map((control, i) => [control, control.values[about.rest[i]]])
+    .map(([control, x]) => (x ? ` Without a ${touched ? "touch" : "key"}, ${symbol(control.name)} is ${valueOf(control, x)}.` : ""))
     .join("");
   /** Whether time waits for the first input: what acts without one would end some episodes at once. */
   const waiting = () => Boolean(unasked && !rerunning && !me.steps && hands.idle);
@@ -226,8 +230,7 @@ function open(root, board, code, tools) {
       const [less, more] = [["left", "right"], ["down", "up"]][i];
       const what = [control.meaning, letter(control)].filter(Boolean).join(" ");
       if (!control.values.length) return `${less} and ${more} for ${what}`;
-      const value = (x) => `${short(x)} ${control.unit}`.trim();
-      return `${less} for ${value(control.values[0])}, ${more} for ${value(control.values[control.values.length - 1])} of ${what}`;
+      return `${less} for ${valueOf(control, control.values[0])}, ${more} for ${valueOf(control, control.values[control.values.length - 1])} of ${what}`;
     })
     .join("; ") + (about.controls.every(({ values }) => values.length) ? "" : ". The farther from the middle, the stronger");
   const starting = (keys) => {
@@ -238,7 +241,8 @@ function open(root, board, code, tools) {
   stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
 
   let { constants } = code;
-  let seed = big(Math.floor(Math.random() * 2 ** 32));
+  const anySeed = () => big(Math.floor(Math.random() * 2 ** 32));
+  let seed = anySeed();
   let me = new Episode(code, seed, constants);
   let mine = [];
   let ghost = null;
@@ -627,7 +631,7 @@ function open(root, board, code, tools) {
   // --- links
 
   /** Recompute a link's drive, a little in each frame, and tell whether its claim is true. */
-  function checkLink(hash) {
+  function checkLink(address) {
     if (rerunning) beginAnew();
     else if (running) pause();
     linked = null;
@@ -636,7 +640,7 @@ function open(root, board, code, tools) {
     listGhosts();
     let told;
     try {
-      told = readLink(hash, about);
+      told = readLink(address, about);
     } catch (error) {
       verdict.textContent = String(error.message);
       verdict.dataset.true = "false";
@@ -683,27 +687,23 @@ function open(root, board, code, tools) {
   }
 
   function followHash() {
-    let { hash } = location;
-    try {
-      hash = decodeURIComponent(hash);
-    } catch {
-      // Left as it is, it will be refused.
-    }
+    const address = hash();
     verdict.textContent = "";
-    if (hash.includes(MARK)) {
+    delete verdict.dataset.true;
+    if (address.includes(MARK)) {
       stage.focus();
-      checkLink(hash);
+      checkLink(address);
       return;
     }
-    const match = /^#seed=(\d{1,20})$/.exec(hash);
-    if (!match) return;
-    if (big(match[1]) >> big(BITS)) {
-      verdict.textContent = "The seed must be below 2 to the power of 64.";
+    if (!address.startsWith("#seed=")) return;
+    const number = /^#seed=(\d+)$/.exec(address)?.[1];
+    const valid = number && !(big(number) >> big(BITS));
+    if (!valid) {
+      verdict.textContent = "The seed must be a whole number from 0 to 2⁶⁴ − 1; this start is a random one.";
       verdict.dataset.true = "false";
-      return;
     }
     stage.focus();
-    seed = big(match[1]);
+    seed = valid ? big(number) : anySeed();
     beginAnew();
   }
 
@@ -735,7 +735,7 @@ function open(root, board, code, tools) {
 
   function another() {
     if (ghost?.replays || ghost?.seed !== undefined) dismissGhost();
-    seed = big(Math.floor(Math.random() * 2 ** 32));
+    seed = anySeed();
     afresh();
   }
 

@@ -378,18 +378,20 @@
     waiting.get(document.currentScript?.getAttribute("src"))?.(what);
   }
 
+  const TOO_OLD = "This browser cannot run the page's program. Browsers from the end of 2020 on can.";
+
   /** Load a file as a script, which works from file:, where fetch does not. */
-  function load(file) {
+  function load(file, what = "The program") {
     if (!fetched.has(file)) {
       const promise = new Promise((resolve, reject) => {
         waiting.set(file, resolve);
         const script = make("script", { src: file });
         script.addEventListener("error", () => {
           fetched.delete(file);
-          reject(new Error(`${file} cannot be loaded`));
+          reject(new Error(`${what} could not be loaded. Check the connection and try again.`));
         });
         // The script has put its data by now, unless it could not be run.
-        script.addEventListener("load", () => reject(new Error(`This browser cannot run ${file}`)));
+        script.addEventListener("load", () => reject(new Error(TOO_OLD)));
         document.head.append(script);
       });
       fetched.set(file, promise);
@@ -398,7 +400,7 @@
   }
 
   /** The episodes in a file. */
-  const episodes = (file) => load(file).then((replays) => replays.map(prepare));
+  const episodes = (file) => load(file, "The episodes").then((replays) => replays.map(prepare));
 
   /** An episode with its columns unpacked. */
   function prepare(replay) {
@@ -1209,12 +1211,21 @@
 
   // --- drive -----------------------------------------------------------------------------------------------
 
+  /** The address from # on; some programs that pass links on write ~ and = as %7E and %3D. */
+  function hash() {
+    try {
+      return decodeURIComponent(location.hash);
+    } catch {
+      return location.hash; // it will be refused
+    }
+  }
+
   /** Let people drive: the program is loaded when somebody asks for it, or opens the link of a drive. */
   function startDrive() {
     const root = find("#drive");
     if (!root) return null;
     const [begin, said] = [find(".begin", root), find(".status", root)];
-    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, calm };
+    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, hash, calm };
     let driver = null;
 
     async function open(wanted) {
@@ -1233,13 +1244,15 @@
         if (wanted) find(".stage", root).focus({ preventScroll: true });
         find(wanted ? ".driver" : "h2", root).scrollIntoView();
       } catch (error) {
-        said.textContent = String(error.message);
+        // Mistakes of the program come from what an old browser lacks.
+        said.textContent = error.constructor === Error ? error.message : TOO_OLD;
+        find(".driver", root).replaceChildren(begin);
         begin.disabled = false;
       }
     }
 
     const linked = () => {
-      if (/^#(drive=|seed=)/.test(location.hash)) open(false);
+      if (/^#(drive=|seed=)/.test(hash())) open(false);
     };
     begin.addEventListener("click", () => open(true));
     window.addEventListener("hashchange", linked);
@@ -1285,6 +1298,12 @@
 
   // --- start -----------------------------------------------------------------------------------------------
 
+  // An old browser shows the page as it is without a script.
+  if (!Element.prototype.replaceChildren) {
+    const said = find("#drive .status");
+    if (said) said.textContent = TOO_OLD;
+    return;
+  }
   window.lagEnvs = { put, load, placed, windowOf, apart };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
