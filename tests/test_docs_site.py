@@ -94,12 +94,17 @@ def test_titles_and_previews(site, pages):
     """Each page has a title of its own, and says what a shared link shows."""
     texts = {name: (site / name).read_text("utf-8") for name in pages}
     titles = {name: re.search("<title>(.*?)</title>", text)[1] for name, text in texts.items()}
+    address = yaml.safe_load(text_of("mkdocs.yml"))["site_url"]
     docs = [title for name, title in titles.items() if not name.startswith("board/")]
     assert len(set(docs)) == len(docs) > 50
     assert titles["index.html"] == "Lagrangian mechanics as Gymnasium environments - lag_envs"
     for name, text in texts.items():
         for what in ("title", "description"):
             assert text.count(f'<meta property="og:{what}"') == 1, name
+        (url,) = re.findall(f'og:url" content="{address}(.*?)"', text)
+        assert url.removesuffix("index.html") == name.removesuffix("index.html")
+        (picture,) = re.findall(f'og:image" content="{address}(.*?)"', text)
+        assert (site / picture).is_file() and text.count('<meta name="twitter:card"') == 1, name
     told = {
         name: re.search('<meta name="description" content="(.*?)">', text)[1] for name, text in texts.items()
     }

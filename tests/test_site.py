@@ -124,7 +124,10 @@ def test_agents_have_pages_and_news_are_fed():
     entries = feed.findall(f"{atom}entry")
     assert [e.findtext(f"{atom}updated")[:10] for e in entries] == ["2026-11-03", "2026-11-02", "2026-11-01"]
     assert entries[1].find(f"{atom}link").get("href") == f"https://example.org/board/{own}.html"
-    assert "og:image" not in render(found)[0][f"{env_id}.html"], "a preview needs a whole address"
+    assert "<title>Leaderboard · lag_envs</title>" in pages["index.html"]
+    bare, _ = render(found)
+    assert "og:image" not in bare[f"{env_id}.html"], "a preview needs a whole address"
+    assert f"<id>urn:lag-envs:{own}</id>" in bare["feed.xml"]
     with pytest.raises(ValueError, match="must begin with https:// or http://, got 'javascript:1'"):
         render(found, "javascript:1")
 

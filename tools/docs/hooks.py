@@ -227,8 +227,12 @@ def preview(page: Page, config: MkDocsConfig) -> str:
 
     title, about = page.meta.get("title", page.title), unescape(page.meta["description"])
     picture = page.title if page.title in TASKS else next(iter(TASKS))
-    shown = f"{MOVING}/{picture}.webp"
     tags = {"type": "article", "site_name": config.site_name, "title": title, "description": about}
-    if (ROOT / "docs" / shown).is_file():
-        tags["image"] = f"{config.site_url}{shown}"
-    return "".join(f'<meta property="og:{name}" content="{escape(str(of))}">\n' for name, of in tags.items())
+    card = ""
+    if config.site_url:
+        tags["url"] = page.canonical_url
+        if (ROOT / "docs" / MOVING / f"{picture}.webp").is_file():
+            tags["image"] = f"{config.site_url}{MOVING}/{picture}-still.webp"
+            card = '<meta name="twitter:card" content="summary_large_image">\n'
+    found = (f'<meta property="og:{name}" content="{escape(str(of))}">\n' for name, of in tags.items())
+    return "".join(found) + card

@@ -71,14 +71,23 @@ COLUMNS = (
         "Interquartile mean, over training seeds, of the mean over episodes. 0 is the random policy's "
         "return, 1 the best known. The bar is the 95 % bootstrap interval.",
     ),
-    Column("return", "Return", "Mean return of an episode."),
+    Column(
+        "return",
+        "Return",
+        "Mean return of an episode, over all training seeds. One that failed lowers it, but hardly the score, "
+        "which leaves out the best and the worst.",
+    ),
     Column(
         "gap",
         "Gap",
         "Optimality gap: how far policies fall short of a score of 1, on average over training seeds.",
         True,
     ),
-    Column("success", "Success", "Share of episodes that succeed, with Wilson's 95 % interval."),
+    Column(
+        "success",
+        "Success",
+        "Share of episodes that succeed, over all training seeds, with Wilson's 95 % interval.",
+    ),
     Column(
         "settle",
         "Settle",
