@@ -42,7 +42,8 @@ def draw_overview(accuracy: dict[str, Any]) -> Figure:
     first = f"{LAG_ENVS}, with a proved bound"
     names = [first, *sorted(set(shown) - {first})]
     figure.legend([shown[name] for name in names], names, loc="outside lower center", ncols=5, fontsize=8)
-    left.annotate("lower left is better", (0.02, 0.03), xycoords="axes fraction", fontsize=8, color="#555555")
+    place = {"xycoords": "axes fraction", "horizontalalignment": "right"}
+    left.annotate("lower left is better", (0.98, 0.03), **place, fontsize=8, color="#555555")
     return figure
 
 
@@ -126,6 +127,7 @@ def _panel(ax: Axes, title: str, own_points: Points, rivals: dict[str, Points]) 
     for name, points in rivals.items():
         known = STYLES.get(name) or STYLES.get(f"{name} Taylor") or STYLES.get(f"{name} RK4")
         colour, marker, line = known or ("#666666", "h", "--")
+        marker = marker.replace("*", "<")  # the star is lag_envs'
         ax.plot(*zip(*points, strict=True), marker + line, color=colour, markersize=5, label=name)
     ax.plot(
         *zip(*own_points, strict=True),

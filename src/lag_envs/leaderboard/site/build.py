@@ -74,8 +74,8 @@ COLUMNS = (
     Column(
         "return",
         "Return",
-        "Mean return of an episode, over all training seeds. One that failed lowers it, but hardly the score, "
-        "which leaves out the best and the worst.",
+        "Mean return of an episode, over all training seeds. One that failed lowers it, but hardly the "
+        "score, which leaves out the best and the worst.",
     ),
     Column(
         "gap",

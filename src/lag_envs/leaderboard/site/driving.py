@@ -123,10 +123,10 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
 def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     """Return the parameters that may be changed while driving.
 
-    Only parameters that have an effect, and for which the changed script steps like an environment made with
-    the changed value: Python code beyond the formulas' arithmetic does not reach the script. The effect on the
-    picture is given at `MARKS`. The limit of the controls is a factor, `shown` in units of the only control or
-    in per cent.
+    Only parameters that have an effect, and for which the changed script steps like an environment made
+    with the changed value: Python code beyond the formulas' arithmetic does not reach the script. The effect
+    on the picture is given at `MARKS`. The limit of the controls is a factor, `shown` in units of the only
+    control or in per cent.
     """
     task, program = env.task, env.program
     names, fields = list(program.given), type(task.scene).__dataclass_fields__
