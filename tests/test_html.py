@@ -143,6 +143,12 @@ def test_environments_show_picture_and_spaces(env_id):
         assert name in shown.text
 
 
+def test_environments_have_a_text():
+    made = gym.make(incline.Tilt.id, mass=2.0, observation_noise=0.1)
+    assert repr(made.unwrapped) == f"LagrangianEnv({incline.Tilt.id}, mass=2.0, observation_noise=0.1)"
+    assert repr(type(made.unwrapped)("lag_envs.tasks.incline:Tilt")) == "LagrangianEnv(Tilt)"
+
+
 def test_batches_show_a_grid():
     envs = gym.make_vec(incline.Tilt.id, 20)
     assert f"{incline.Tilt.id} × 20 (the first 9 are shown)" in Checked(envs._repr_html_()).text

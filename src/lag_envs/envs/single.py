@@ -93,6 +93,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._look = check_look(show_arrows, show_trail, show_readout)
         #: Whether there is something to draw or count after each step.
         self._seen = render_mode == "human" or bool(show_readout)
+        self._options = options
         self.task: Task = load_task(task)(**options)
         self.scene, self._limit = self.task.scene, self.task.limit
         self.__doc__ = self.task.__doc__
@@ -336,14 +337,22 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     #: Sum of the episode's rewards, if pictures show it.
     _total = 0.0
 
+    @property
+    def _name(self) -> str:
+        return self.spec.id if self.spec else type(self.task).__name__
+
+    def __repr__(self) -> str:
+        """Return the id and the parameters that were given."""
+        given = (f"{name}={value!r}" for name, value in self._options.items())
+        return f"{type(self).__name__}({', '.join([self._name, *given])})"
+
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: the current picture, spaces, controls, parameters."""
         from lag_envs.envs.html import environment_html, still
 
         now = (self.state, self.control, self.target) if self._started else ()
-        title = self.spec.id if self.spec else type(self.task).__name__
         spaces = {"observation": self.observation_space, "action": self.action_space}
-        return environment_html(self.task, title, spaces, still(self.task, *now))
+        return environment_html(self.task, self._name, spaces, still(self.task, *now))
 
     # --- internal ------------------------------------------------------------------------------------------
 
