@@ -693,6 +693,14 @@ def test_reduced_motion(open_page):
     assert not page.evaluate("!!document.querySelector('.playing')"), "nothing moves that was not asked to"
 
 
+def test_on_paper_the_tables_remain(open_page):
+    page = open_page(color_scheme="dark")
+    page.emulate_media(media="print")
+    for part, shown in {"#ranking": True, "#drive": False, "#watch": False, ".pick": False}.items():
+        assert page.is_visible(part) == shown, part
+    assert page.evaluate("getComputedStyle(document.documentElement).colorScheme") == "light"
+
+
 def test_without_script_the_tables_remain(open_page):
     page = open_page(java_script_enabled=False)
     assert page.evaluate("document.querySelector('.ranking').innerText").count("\n") > 20
