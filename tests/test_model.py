@@ -126,6 +126,12 @@ def test_bad_input_is_named():
     ):
         with pytest.raises(ValueError, match=message):
             model.vjp(state, [0.0, 0.0], 0.1, **given)
+    bar = Model(make("PivotedBar-v0").task)
+    for parameters in ((), ("damping",)):  # as one record, and with the motion by itself
+        with pytest.raises(
+            ValueError, match=r"gradient of row 1 is not finite, with by_states=.* scale them"
+        ):
+            bar.vjp(np.ones((2, 4)), [0, 0], by_states=[[1.0] * 4, [1e308] * 4], parameters=parameters)
     with pytest.raises(ValueError, match="has no target"):
         Model(make("PivotedBar-v0").task)(np.zeros((1, 4)), [0.0], 0.1)
     with pytest.raises(StepRefused, match="row 1"):

@@ -195,14 +195,28 @@ def test_masks_that_leave_no_environment_may_come_first():
     assert torch.equal(envs.state, others.state)
 
 
-@pytest.mark.parametrize("env_id", [pivoted_bar.SwingUp.id, slow(pivoted_bar.SwingUpFree.id)])
+@pytest.mark.parametrize(
+    "env_id", [pivoted_bar.SwingUp.id, slow(pivoted_bar.SwingUpFree.id), slow(CartPoleContinuous.id)]
+)
 def test_a_loss_that_is_not_a_number_has_no_gradient(env_id):
-    """Also where a guard chooses between two controls."""
+    """Also where a guard chooses between two controls, and where the motion is the general series."""
     envs = TorchVectorEnv(env_id, 2)
     envs.reset(seed=0)
     actions = torch.full((2, 1), 0.3, requires_grad=True)
     (envs.step(actions)[1] * torch.tensor([math.nan, 1.0])).sum().backward()
     assert actions.grad[0].isnan() and actions.grad[1].isfinite()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("seed", [math.nan, math.inf, 1e308])
+def test_a_gradient_that_is_not_finite_stays_in_its_row(env_id, step, seed):
+    step = step if env_id == IDS[0] else Step(env_id)
+    given = tuple(near(2))
+    plain = torch.autograd.grad(step(*given).states.sum(), given)
+    found = torch.autograd.grad((step(*given).states * torch.tensor([[1.0], [seed]])).sum(), given)
+    for by, expected in zip(found, plain, strict=True):
+        torch.testing.assert_close(by[0], expected[0], rtol=1e-14, atol=1e-14)
+        assert not by[1].isfinite().all()
 
 
 def test_detach_cuts_gradients():

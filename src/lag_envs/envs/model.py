@@ -235,7 +235,7 @@ class Model:
         ------
         ValueError, StepRefused
             As a step does; ValueError also for a task whose actions are choices, for unknown parameters, and
-            for a gradient that is not finite.
+            for a gradient that is not finite, with its row.
         """
         reverse = self.reverse(check_parameters(self.task.scene, parameters))
         shape = np.shape(actions)
@@ -244,16 +244,22 @@ class Model:
         states, actions, targets = self._checked(states, actions, targets)
         n, observations = len(states), len(self.task.formulas.observation)
         ends = _rows("ends", ends, states.shape, single=False)
-        slopes = reverse.pull(
-            states,
-            actions,
-            targets,
-            ends,
-            ends if isinstance(kicks, float) and kicks == 0.0 else ends + _rows("kicks", kicks, ends.shape),
-            _rows("by_states", by_states, (n, self._n_state)),
-            _rows("by_observations", by_observations, (n, observations)),
-            _rows("by_rewards", by_rewards, (n,)),
+        kicked = (
+            ends if isinstance(kicks, float) and kicks == 0.0 else ends + _rows("kicks", kicks, ends.shape)
         )
+        seeds = {
+            "by_states": _rows("by_states", by_states, (n, self._n_state)),
+            "by_observations": _rows("by_observations", by_observations, (n, observations)),
+            "by_rewards": _rows("by_rewards", by_rewards, (n,)),
+        }
+        slopes = reverse.pull(states, actions, targets, ends, kicked, *seeds.values())
+        if not all(np.isfinite(x).all() for x in slopes):
+            row = int(np.argmin(np.isfinite(np.concatenate(slopes, axis=1)).all(axis=1)))
+            given = ", ".join(f"{name}={x[row].tolist()}" for name, x in seeds.items())
+            raise ValueError(
+                f"the gradient of row {row} is not finite, with {given}: if these are large, scale them down; "
+                "otherwise a formula has an infinite slope there"
+            )
         slopes[1] = slopes[1].reshape(shape)
         return Gradient(*slopes)
 

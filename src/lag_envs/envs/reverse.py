@@ -92,6 +92,12 @@ class Reverse:
             The states after the motion, and after the kick too; the same array if there was no kick.
         by_states, by_observations, by_rewards : ndarray, shape (n, n_state), (n, n_observations), (n,)
             The gradient with respect to `after`, its observations, and the rewards.
+
+        Returns
+        -------
+        list of ndarray, shape (n, ...)
+            Not finite in rows whose given gradient is not finite or is too large; the others are as without
+            them.
         """
         check_turns(self._task.scene, states)
         check_turns(self._task.scene, ends)

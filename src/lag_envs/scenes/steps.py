@@ -186,7 +186,14 @@ def vjp(
         raise ValueError(f"cotangent must be finite, got {seeds[at]} at {at}")
     if form_of(scene):
         check_turns(scene, states)
-    found = pulled(scene, states, controls, check_step(dt), seeds.reshape(-1, n), by)
+    seeds = seeds.reshape(-1, n)
+    found = pulled(scene, states, controls, check_step(dt), seeds, by)
+    if not np.isfinite(found).all():
+        row = int(np.argwhere(~np.isfinite(found))[0, 0])
+        raise ValueError(
+            f"the gradient of row {row} is not finite: its cotangent {seeds[row].tolist()} is too large; "
+            "scale it down"
+        )
     found = found.reshape(*shape, n + m + len(by))
     parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
     return parts[:2] if parameters is None else parts
@@ -201,20 +208,19 @@ def pulled(
     by: tuple[str, ...],
     rows: Sequence[int] | None = None,
 ) -> Array:
-    """Return `vjp` of rows of checked arrays, also by `check_turns`; errors name the rows by `rows`."""
+    """Return `vjp` of rows of checked arrays, also by `check_turns`; errors name the rows by `rows`.
+
+    Rows are not finite where their cotangents are not, or are too large.
+    """
     derivatives = _derivatives(scene, by)
     found, refused = derivatives.vjp(states, controls, dt, cotangents)
     if not refused and not np.isfinite(found).all():
-        refused = int(np.argwhere(~np.isfinite(found))[0, 0]) + 1
-    if refused:
-        i = refused - 1
-        slopes, step_refused = derivatives.jacobian(states[i : i + 1], controls[i : i + 1], dt)
-        if not step_refused and np.isfinite(slopes).all():
-            large = "is too large; scale it down" if np.isfinite(cotangents[i]).all() else "is not finite"
-            raise ValueError(
-                f"the gradient of row {i if rows is None else rows[i]} is not finite: its cotangent "
-                f"{cotangents[i].tolist()} {large}"
-            )
+        (bad,) = np.nonzero(~np.isfinite(found).all(axis=1))
+        slopes, step_refused = derivatives.jacobian(states[bad], controls[bad], dt)
+        if step_refused:
+            refused = int(bad[step_refused - 1]) + 1
+        elif not np.isfinite(slopes).all():
+            refused = int(bad[np.argwhere(~np.isfinite(slopes))[0, 0]]) + 1
     _check_refused(scene, states, controls, dt, refused, rows)
     return found
 
