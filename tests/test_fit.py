@@ -306,7 +306,8 @@ def test_undetermined_together():
 def test_undetermined_alone():
     """All rods fall alike, except for the damping, which is tiny."""
     free = motion(rod, ROD | {"damping": 0.0}, [2.0, 0.0], np.zeros(40))
-    with pytest.raises(ValueError, match="do not determine mass, which has no effect of its own"):
+    message = "do not determine mass, which has no effect of its own .* Leave mass out of free, so that it is"
+    with pytest.raises(ValueError, match=message):
         Pendulum(damping=1e-14).fit([(noisy(free, 0.01, 1), None, DT)], ["length", "mass"])
 
 
@@ -326,6 +327,20 @@ def test_at_rest():
     still = np.tile([math.pi, 0.0], (100, 1))
     with pytest.raises(ValueError, match=r"do not determine length, .* measured\. Add recordings"):
         Pendulum(mass=0.3, length=0.8, damping=0.01).fit([(still, None, 0.02)], ["length"])
+    with pytest.raises(
+        ValueError, match=r"determine mass, .*; nor length, .* Add recordings in which they have"
+    ):
+        Pendulum().fit([(still, None, 0.02)], ["mass", "length"])
+
+
+def test_a_model_that_is_wrong():
+    """Its parameters run away to where they have no effect, which is not the data's fault."""
+    states, torques = swings()
+    for data, controls in ((-states, torques), (states, -torques)):
+        with pytest.raises(ValueError, match=r"^mass=\S+ grew without bound: .* its sign, .* may be wrong$"):
+            Pendulum().fit([(noisy(data, 0.01, 1), controls, DT)], list(ROD))
+    with pytest.raises(ValueError, match=r"such as some under known controls.* a control, .* is wrong$"):
+        Pendulum().fit([(noisy(states, 0.01, 1), None, DT)], list(ROD))
 
 
 def test_at_the_end_of_its_range():
@@ -361,6 +376,7 @@ def test_what_was_misread():
         found = Pendulum(mass=ROD["mass"]).fit([(data, torques, DT)], ["length", "damping"])
     (text,) = found.warnings
     assert f"the largest, 0.48 rad, at {30 * DT:.4g} s. If so, give NaN there" in text
+    assert "intervals do not hold" in text
     data[[30, 77], 0] = np.nan
     assert found.scene.fit([(data, torques, DT)], ["length", "damping"]).warnings == ()
 
@@ -381,10 +397,16 @@ def test_without_bound():
     sought = FreeParameters(Pendulum(), ("length", "damping"))
     estimates, errors = {"length": 0.5, "damping": 4e6}, {"length": 0.1, "damping": 1e10}
     fitted = SimpleNamespace(estimates=estimates, errors=errors, correlation=np.eye(2))
-    for converged, told in ((False, "damping=4e+06 grew without bound"), (True, "end of its range")):
-        best = sought.scaled([0.5, 4e6]), np.array([0.2, 1e10])
+    best = sought.scaled([0.5, 4e6]), np.array([0.2, 1e10])
+    for converged, told in (
+        (False, "damping=4e+06 grew without bound"),
+        (True, "hardly determine damping: 4e"),
+    ):
         (text,) = fit._doubts_of_parameters(fitted, sought, *best, converged)
         assert told in text
+    estimates["damping"] = 1e-30  # with the same error, but at the end
+    (text,) = fit._doubts_of_parameters(fitted, sought, sought.scaled([0.5, 1e-30]), best[1], True)
+    assert "damping=1e-30 lies at the end of its range" in text
 
 
 # --- display ---

@@ -257,8 +257,8 @@ class Model:
             row = int(np.argmin(np.isfinite(np.concatenate(slopes, axis=1)).all(axis=1)))
             given = ", ".join(f"{name}={x[row].tolist()}" for name, x in seeds.items())
             raise ValueError(
-                f"the gradient of row {row} is not finite, with {given}: if these are large, scale them down; "
-                "otherwise a formula has an infinite slope there"
+                f"the gradient of row {row} is not finite, with {given}: if these are large, scale them "
+                "down; otherwise a formula has an infinite slope there"
             )
         slopes[1] = slopes[1].reshape(shape)
         return Gradient(*slopes)

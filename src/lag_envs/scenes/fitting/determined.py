@@ -14,6 +14,8 @@ DEPENDENT = 1e-7
 #: A parameter has no effect if doubling it, or adding one unit, moves no state by more than this part of its
 #: range.
 NO_EFFECT = 1e-10
+#: What may be wrong if a parameter runs away.
+SUSPECTS = "a held parameter, a control, or a measurement (its zero, its sign, single values)"
 
 
 class Determined:
@@ -49,6 +51,7 @@ class Determined:
         self._parameters = shooting.parameters
         p, of = len(self._parameters.names), shooting.states_of_residuals()
         values = self._parameters.values(z[:p])
+        self._grown = self._parameters.grown(z[:p]).any()
         self._whole = np.where(self._parameters.logs, 1.0, values)  # a change by 100 %, scaled
         derivatives = shooting.jacobian(z)
         by_parameters, by_starts = derivatives[:, :p], derivatives[:, p:]
@@ -72,7 +75,8 @@ class Determined:
 
     def _refuse(self, directions: list[Array], values: Array) -> None:
         """Raise an error for directions in which the scaled parameters can change without any effect."""
-        texts = []
+        texts: list[str] = []
+        alone: list[str] = []  # parameters that have no effect of their own
         for direction in directions:
             change = direction / self._whole
             change = change / change[np.argmax(np.abs(change))]
@@ -82,19 +86,26 @@ class Determined:
                 if abs(part) > 1e-3
             }
             if len(parts) == 1:
-                texts.append(f"{next(iter(parts))}, which has no effect of its own on what was measured")
+                alone += parts
+                texts.append(f"{alone[-1]}, which has no effect of its own on what was measured")
             else:
                 texts.append(
                     f"{' and '.join(parts)} apart: changing {', '.join(parts.values())} together changes "
                     "nothing that was measured"
                 )
         if texts:
-            names = zip(self._parameters.names, values, strict=True)
-            ended = ", ".join(f"{name}={value:.3g}" for name, value in names)
-            several = len(self._parameters.names) > 1
-            remedy = "Leave one out of free, so that it is held, or add" if several else "Add"
+            names, count = self._parameters.names, len(texts)
+            ended = ", ".join(f"{name}={value:.3g}" for name, value in zip(names, values, strict=True))
+            it, held, has = ("it", "is held", "has") if count == 1 else ("they", "are held", "have")
+            some = " and ".join(alone) if len(alone) == count else f"{'one' if count == 1 else count} of them"
+            others = len(alone) < len(names)
+            remedy = f"Leave {some} out of free, so that {it} {held}, or add" if others else "Add"
+            far_off = (
+                f"such values mean that nothing moved, or that {SUSPECTS} is wrong"
+                if self._grown
+                else "if that is far off, begin closer to the truth"
+            )
             raise ValueError(
-                f"the data do not determine {'; nor '.join(texts)}. {remedy} recordings in which it has an "
-                f"effect, such as some under known controls. The search ended at {ended}; if that is far "
-                "off, begin closer to the truth"
+                f"the data do not determine {'; nor '.join(texts)}. {remedy} recordings in which {it} {has} "
+                f"an effect, such as some under known controls. The search ended at {ended}; {far_off}"
             )

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lag_envs.errors import hint
 from lag_envs.scenes.checks import StepRefused, check_number, check_parameters, shown
 from lag_envs.scenes.derivation import layout_of
-from lag_envs.scenes.fitting.determined import Determined
+from lag_envs.scenes.fitting.determined import SUSPECTS, Determined
 from lag_envs.scenes.fitting.parameters import FreeParameters
 from lag_envs.scenes.fitting.recordings import Recording, doubtful_units, guess, recordings_of
 from lag_envs.scenes.fitting.result import Fit, FitWarning
@@ -45,8 +45,6 @@ MISFIT, INVISIBLE = 2.0, 1e-6
 #: A residual this many times the spread of its state's residuals (that of a normal distribution with the same
 #: median of sizes) is an outlier, if there are at least so many.
 OUTLYING, LEAST_COUNT = 6.0, 20
-#: A search that did not converge, and left a parameter at this many times its first value, had no end.
-ENDLESS = 1e3
 #: How often the noise is estimated, and the fit repeated with it, at most.
 WEIGHINGS = 8
 
@@ -89,7 +87,7 @@ def fit(
     for _ in range(WEIGHINGS):
         shooting = shooting.weighed(sizes.noise, CLOSING[-1] * sizes.gap)
         found = shooting.solve(z, FINE)
-        z, known = found.x, Determined(shooting, found.x, sizes.range)
+        z, known = found.x, _determined(shooting, found.x, sizes.range)
         sizes.estimate(shooting, z, known.leverage)
         if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
             break
@@ -203,6 +201,27 @@ def _explained(error: StepRefused, scene: Scene, data: list[Recording], sizes: _
     )
 
 
+def _determined(shooting: Shooting, z: Array, ranges: Array) -> Determined:
+    """Return what the data determine; raise a ValueError, with the reason, if a parameter has no effect."""
+    try:
+        return Determined(shooting, z, ranges)
+    except ValueError as error:
+        parameters, p = shooting.parameters, len(shooting.parameters.names)
+        grown = parameters.grown(z[:p])
+        if not grown.any():
+            raise
+        try:  # at the first values
+            Determined(shooting, np.concatenate([parameters.start, z[p:]]), ranges)
+        except (StepRefused, ValueError):
+            raise error from None
+        named = zip(parameters.names, parameters.values(z[:p]), grown, strict=True)
+        raise ValueError(_endless(", ".join(f"{n}={v:.3g}" for n, v, far in named if far))) from error
+
+
+def _endless(named: str) -> str:
+    return f"{named} grew without bound: nowhere does the model follow the data; {SUSPECTS} may be wrong"
+
+
 def _result(
     shooting: Shooting,
     found: Any,
@@ -239,10 +258,16 @@ def _result(
         recordings=list(shooting.recordings),
         simulated=simulated,
     )
-    texts = [] if found.success else ["the search ended before it converged; begin closer to the truth"]
-    texts += _doubts_of_parameters(fitted, parameters, best, errors, found.success)
-    texts += _doubt_of_motion(fitted, sizes)
-    texts += _doubts_of_model(fitted, sizes, relaxed)
+    texts = misread = _misread(fitted, sizes)
+    if not found.success:
+        remedy = "" if misread else "; begin closer to the truth"
+        texts = [*texts, f"the search ended before it converged{remedy}"]
+    texts = [
+        *texts,
+        *_doubts_of_parameters(fitted, parameters, best, errors, found.success),
+        *_doubt_of_motion(fitted, sizes),
+        *_doubts_of_model(fitted, sizes, relaxed),
+    ]
     for text in texts:
         warnings.warn(text, FitWarning, stacklevel=4)
     return dataclasses.replace(fitted, warnings=(*doubts, *texts))
@@ -252,15 +277,15 @@ def _doubts_of_parameters(
     fitted: Fit, parameters: FreeParameters, best: Array, errors: Array, converged: bool
 ) -> list[str]:
     """Return warnings about the estimates of the parameters."""
-    texts, names, first = [], list(fitted.estimates), parameters.values(parameters.start)
+    texts, names, grown = [], list(fitted.estimates), parameters.grown(best)
     for i, (name, value) in enumerate(fitted.estimates.items()):
         wide = fitted.errors[name] > WIDE * abs(value)
-        if wide and not converged and abs(value) > ENDLESS * abs(first[i]):
-            texts.append(
-                f"{name}={value:.3g} grew without bound: no value of it makes the model follow the data; "
-                "something that is held may be wrong, or the zero or sign of a measurement"
-            )
-        elif min(best[i] - parameters.low[i], parameters.high[i] - best[i]) < 0.01 * errors[i]:
+        end = min(parameters.low[i], parameters.high[i], key=lambda end: abs(best[i] - end))
+        # With an error wide enough, every value is near the end: then nearly all of the way there counts.
+        reach = min(errors[i], abs(parameters.start[i] - end)) if wide else errors[i]
+        if wide and not converged and grown[i]:
+            texts.append(_endless(f"{name}={value:.3g}"))
+        elif abs(best[i] - end) < 0.01 * reach:
             texts.append(f"{name}={value:.3g} lies at the end of its range: its interval is too short")
         elif wide:
             texts.append(
@@ -301,16 +326,10 @@ def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
     `relaxed` is the noise that remains if the motion may have gaps.
     """
     texts = []
-    for i in np.flatnonzero(sizes.seen):
-        name = fitted.scene.state_names[i]
-        unit = fitted.scene.state_units[i]
-        columns = [residual[:, i] for residual in fitted.residuals]
-        known = np.concatenate([c[np.isfinite(c)] for c in columns])
+    for i, columns, known in _visible(fitted, sizes):
+        name, unit = fitted.scene.state_names[i], fitted.scene.state_units[i]
         size = math.sqrt(np.mean(known**2))
         least = sizes.noise[i] if sizes.given else relaxed[i]
-        if size < INVISIBLE * sizes.range[i]:
-            continue
-        texts += _outliers(fitted, name, columns)
         if size > MISFIT * least:
             there = "where the noise was given as" if sizes.given else "where short pieces of it are off by"
             texts.append(
@@ -328,20 +347,32 @@ def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
     return texts
 
 
-def _outliers(fitted: Fit, name: str, columns: Sequence[Array]) -> list[str]:
-    """Return a warning about residuals of a state, by recording, that are far larger than the others."""
-    sizes = [np.nan_to_num(np.abs(c)) for c in columns]
-    known = np.concatenate([np.abs(c[np.isfinite(c)]) for c in columns])
-    far = OUTLYING * 1.4826 * float(np.median(known))
-    count = int(np.sum(known > far))
-    if len(known) < LEAST_COUNT or not count:
-        return []
-    which = int(np.argmax([size.max() for size in sizes]))
-    row = int(np.argmax(sizes[which]))
-    recording, unit = fitted.recordings[which], fitted.scene.state_units[fitted.scene.state_names.index(name)]
-    where = f" of recording {which}" if len(columns) > 1 else ""
-    return [
-        f"{count} value{'s' * (count > 1)} of {name} may be misread: off by more than {far:.2g} {unit}, "
-        f"{OUTLYING:g} times the spread of the others; the largest, {sizes[which][row]:.2g} {unit}, at "
-        f"{row * recording.dt:.4g} s{where}. If so, give NaN there"
-    ]
+def _misread(fitted: Fit, sizes: _Sizes) -> list[str]:
+    """Return warnings about residuals that are far larger than the others of the same state."""
+    texts = []
+    for i, columns, known in _visible(fitted, sizes):
+        name, unit = fitted.scene.state_names[i], fitted.scene.state_units[i]
+        far = OUTLYING * 1.4826 * float(np.median(np.abs(known)))
+        count = int(np.sum(np.abs(known) > far))
+        if len(known) < LEAST_COUNT or not count:
+            continue
+        absolute = [np.nan_to_num(np.abs(c)) for c in columns]
+        which = int(np.argmax([c.max() for c in absolute]))
+        row = int(np.argmax(absolute[which]))
+        where = f" of recording {which}" if len(columns) > 1 else ""
+        texts.append(
+            f"{count} value{'s' * (count > 1)} of {name} may be misread: off by more than {far:.2g} {unit}, "
+            f"{OUTLYING:g} times the spread of the others; the largest, {absolute[which][row]:.2g} {unit}, "
+            f"at {row * fitted.recordings[which].dt:.4g} s{where}. If so, give NaN there; with them, "
+            "estimates and intervals do not hold"
+        )
+    return texts
+
+
+def _visible(fitted: Fit, sizes: _Sizes) -> Iterator[tuple[int, list[Array], Array]]:
+    """Yield each measured state whose residuals matter, with them: by recording, and all finite ones."""
+    for i in np.flatnonzero(sizes.seen).tolist():
+        columns = [residual[:, i] for residual in fitted.residuals]
+        known = np.concatenate([c[np.isfinite(c)] for c in columns])
+        if math.sqrt(np.mean(known**2)) >= INVISIBLE * sizes.range[i]:
+            yield i, columns, known

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 #: Starting value of a parameter that is 0: at 0 its terms would be left out of the motion.
 NEARLY_ZERO = 1e-6
+#: A parameter at this many times its first value, or at this many units if that is 0, may have run away.
+ENDLESS = 1e3
 
 
 class FreeParameters:
@@ -62,6 +64,11 @@ class FreeParameters:
     def slopes(self, scaled: Array) -> Array:
         """Return the derivatives of the values with respect to the scaled ones."""
         return np.where(self.logs, self.values(scaled), 1.0)
+
+    def grown(self, scaled: Array) -> NDArray[np.bool_]:
+        """Return whether each value is more than `ENDLESS` times its first one."""
+        first = [abs(getattr(self._scene, name)) or 1.0 for name in self.names]
+        return np.abs(self.values(scaled)) > ENDLESS * np.array(first)
 
     def scene(self, scaled: Array) -> Scene:
         """Return the scene with these values of its free parameters."""
