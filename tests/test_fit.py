@@ -393,6 +393,14 @@ def test_degrees():
         scene.fit([(given[0][0][:3], None, 0.02)], ["length"])
 
 
+def test_an_interval_in_milliseconds():
+    """It is told at once; the search would take minutes."""
+    states, torques = swings()
+    told = r"a step of recording 0 lasts 40 s and needs \d{4} substeps, .* not in seconds, convert it"
+    with pytest.warns(FitWarning, match=told), pytest.raises(ValueError, match="too few"):
+        Pendulum().fit([(states[:2], torques[:1], 1e3 * DT)], list(ROD))
+
+
 def test_without_bound():
     sought = FreeParameters(Pendulum(), ("length", "damping"))
     estimates, errors = {"length": 0.5, "damping": 4e6}, {"length": 0.1, "damping": 1e10}

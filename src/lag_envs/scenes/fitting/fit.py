@@ -17,7 +17,13 @@ from lag_envs.scenes.checks import StepRefused, check_number, check_parameters, 
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.fitting.determined import SUSPECTS, Determined
 from lag_envs.scenes.fitting.parameters import FreeParameters
-from lag_envs.scenes.fitting.recordings import Recording, doubtful_units, guess, recordings_of
+from lag_envs.scenes.fitting.recordings import (
+    Recording,
+    doubtful_interval,
+    doubtful_units,
+    guess,
+    recordings_of,
+)
 from lag_envs.scenes.fitting.result import Fit, FitWarning
 from lag_envs.scenes.fitting.shooting import Shooting, cut
 
@@ -69,17 +75,18 @@ def fit(
     if not 0.0 < level < 1.0:
         raise ValueError(f"level must be between 0 and 1, got {level:g}")
     data = recordings_of(scene, recordings)
+    sizes, parameters = _Sizes(scene, data, noise), FreeParameters(scene, names)
     doubts = doubtful_units(scene, data)
+    doubts += doubtful_interval(parameters.scene(parameters.start), data, sizes.guesses)
     for text in doubts:  # now, for the search would be long and may fail
         warnings.warn(text, FitWarning, stacklevel=3)
-    sizes = _Sizes(scene, data, noise)
     unknowns = len(names) + len(data) * len(scene.state_names)
     if sizes.count <= unknowns:
         raise ValueError(
             f"{sizes.count} measured values are too few for {len(names)} parameters and the "
             f"{unknowns - len(names)} entries of the starts of {len(data)} recordings; record longer"
         )
-    shooting, z = _approach(FreeParameters(scene, names), data, sizes)
+    shooting, z = _approach(parameters, data, sizes)
     relaxed = sizes.noise.copy()
     for part in CLOSING:
         shooting = shooting.weighed(sizes.noise, part * sizes.gap)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import numbers
 from collections.abc import Sequence
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.scenes.checks import check_sequence, check_step, is_masked, real_array
+from lag_envs.scenes.checks import StepRefused, check_sequence, check_step, is_masked, real_array
 from lag_envs.scenes.derivation import layout_of
+from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
@@ -26,6 +28,8 @@ TRIED, MOST_TRIED, COMPARED = 16, 4096, 64
 MANY_TURNS, OFTEN = 100.0, 0.1
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
+#: A step of more substeps than this is long: those of well-sampled motions need a few.
+LONG = 40
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -161,6 +165,22 @@ def doubtful_units(scene: Scene, data: Sequence[Recording]) -> list[str]:
                 "np.radians"
             )
     return texts
+
+
+def doubtful_interval(scene: Scene, data: Sequence[Recording], guesses: Sequence[Array]) -> list[str]:
+    """Return a warning if the steps of a recording need many substeps: the interval may not be in seconds."""
+    counts = []
+    for recording, states in zip(data, guesses, strict=True):
+        at = len(recording.controls) // 2
+        with contextlib.suppress(StepRefused):
+            counts.append(scene.step_bound(states[at], recording.controls[at], recording.dt).substeps)
+    if len(counts) < len(data) or not LONG < max(counts) <= MAX_SUBSTEPS:  # beyond, steps are refused
+        return []
+    i = int(np.argmax(counts))
+    return [
+        f"a step of recording {i} lasts {data[i].dt:g} s and needs {counts[i]} substeps, so the search will "
+        "take long; if the interval is not in seconds, convert it"
+    ]
 
 
 def _row(bad: NDArray[np.bool_]) -> int:
