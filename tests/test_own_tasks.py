@@ -105,6 +105,11 @@ def test_targets():
     np.testing.assert_array_equal(vec.unwrapped.target, [[0.1, -1.3], [0.2, -1.4]])
     vec.reset(seed=0, options={"target": {"x_goal": 0.3, "y_goal": [-1.3, -1.4]}})
     np.testing.assert_array_equal(vec.unwrapped.target, [[0.3, -1.3], [0.3, -1.4]])
+    vec.reset(seed=0, options={"target": {"x_goal": np.array([0.1, 0.2]), "y_goal": np.array(-1.5)}})
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.1, -1.5], [0.2, -1.5]])
+    told = r"options\['target'\]\['y_goal'\] must be one number or have shape \(2,\), got shape \(1,\)"
+    with pytest.raises(ValueError, match=told):
+        vec.reset(options={"target": {"x_goal": 0.3, "y_goal": [-1.3]}})
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

@@ -11,7 +11,7 @@ from covering import slow
 
 import lag_envs
 from lag_envs.envs.model import Model
-from lag_envs.tasks import TASKS, pivoted_bar
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleExact
 
 torch = pytest.importorskip("torch")
@@ -217,6 +217,13 @@ def test_a_gradient_that_is_not_finite_stays_in_its_row(env_id, step, seed):
     for by, expected in zip(found, plain, strict=True):
         torch.testing.assert_close(by[0], expected[0], rtol=1e-14, atol=1e-14)
         assert not by[1].isfinite().all()
+
+
+def test_targets_may_be_tensors():
+    envs = TorchVectorEnv(incline.Tilt.id, 2)
+    for target in (torch.tensor([0.1, 0.2], requires_grad=True), torch.tensor(0.1)):
+        envs.reset(options={"target": {"target": target}})
+        np.testing.assert_array_equal(envs.envs.target, target.expand(2).detach().to(torch.float64))
 
 
 def test_detach_cuts_gradients():

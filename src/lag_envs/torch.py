@@ -15,7 +15,7 @@ torch.Size([2, 1])
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium as gym
@@ -290,9 +290,8 @@ class TorchVectorEnv:
                     "options['state'] is the result of other operations: give state.detach(), or use "
                     "lag_envs.torch.Step for gradients through it"
                 )
-        plain = {k: v.detach().numpy() if isinstance(v, Tensor) else v for k, v in given.items()}
         before = self._before(mask)
-        observations, infos = self.envs.reset(seed=seed, options=plain or None)
+        observations, infos = self.envs.reset(seed=seed, options=_plain(given) or None)
         now = torch.from_numpy(self.envs.state)
         if isinstance(state, Tensor) and state.requires_grad:
             now = state.to(torch.float64)
@@ -544,6 +543,13 @@ def _replaced(x: NDArray[Any], rows: NDArray[np.intp], values: Any) -> NDArray[A
         x = np.array(x)
         x[rows] = values
     return x
+
+
+def _plain(value: Any) -> Any:
+    """Return tensors, also those in a mapping, as arrays; others unchanged."""
+    if isinstance(value, Mapping):
+        return {name: _plain(v) for name, v in value.items()}
+    return value.detach().numpy() if isinstance(value, Tensor) else value
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:

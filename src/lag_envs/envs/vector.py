@@ -38,7 +38,6 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
 
 BOOL = np.dtype(np.bool_)
-SEQUENCES = (list, tuple, np.ndarray)
 
 
 class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
@@ -219,13 +218,15 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
             names = ", ".join(self.scene.state_names)
             raise ValueError(f"options['state'] must be rows of ({names}), without names, got {shown(state)}")
         if state is not None:
-            state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
+            state = self._check_rows("options['state']", state, (self.num_envs, len(self.scene.state_names)))
             state = np.array([for_environment(i, self.tasks[i].start_state, state[i]) for i in lanes])
         if target is not None:
             many = self.task.formulas.targets
             if many and isinstance(target, Mapping):
                 target = self._targets_by_name(target)
-            target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
+            target = self._check_rows(
+                "options['target']", target, (self.num_envs, *([many] if many > 1 else []))
+            )
             target = np.array(
                 [np.atleast_1d(for_environment(i, self.tasks[i].check_target, target[i])) for i in lanes]
             )
@@ -615,21 +616,28 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
             raise ValueError(f"{name} must select at least one environment, got {shown(mask)}")
         return mask
 
-    def _check_rows(self, name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        array = real_array(f"options[{name!r}]", values)
-        if array.shape != shape:
-            raise ValueError(
-                f"options[{name!r}] must have shape {shape}, got shape {array.shape}: {shown(values)}"
-            )
-        return array
+    def _check_rows(
+        self, name: str, values: Any, shape: tuple[int, ...], single: bool = False
+    ) -> NDArray[np.float64]:
+        """Return values of a shape, or where `single` one number for all; or raise a ValueError."""
+        array = real_array(name, values)
+        if array.shape != shape and not (single and array.ndim == 0):
+            wanted = f"be one number or have shape {shape}" if single else f"have shape {shape}"
+            raise ValueError(f"{name} must {wanted}, got shape {array.shape}: {shown(values)}")
+        return np.broadcast_to(array, shape)
 
     def _targets_by_name(self, given: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return targets given by name, each one number for all or one for each environment, as rows."""
         names = [t.name for t in self.task.formulas.target_boxes]
         if set(given) != set(names):
             raise ValueError(f"target must give {', '.join(names)}, got {shown(given)}")
-        columns = (v if isinstance(v, SEQUENCES) else [v] * self.num_envs for v in map(given.get, names))
-        rows = np.stack([self._check_rows("target", c, (self.num_envs,)) for c in columns], axis=-1)
+        rows = np.stack(
+            [
+                self._check_rows(f"options['target'][{name!r}]", given[name], (self.num_envs,), single=True)
+                for name in names
+            ],
+            axis=-1,
+        )
         return rows[:, 0] if len(names) == 1 else rows
 
     def __getstate__(self) -> dict[str, Any]:
@@ -688,7 +696,7 @@ def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
 def _is_one_target(kind: type[Task], values: Any) -> bool:
     """Return whether a sequence has a number for each of several targets: the same for all environments."""
     several = isinstance(kind.target, Mapping) and len(kind.target) > 1
-    return several and not any(isinstance(v, (Mapping, *SEQUENCES)) for v in values)
+    return several and not any(isinstance(v, (Mapping, list, tuple, np.ndarray)) for v in values)
 
 
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
