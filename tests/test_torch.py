@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from covering import slow
+from gymnasium.error import ResetNeeded
 
 import lag_envs
 from lag_envs.envs.model import Model
@@ -64,6 +65,7 @@ def test_torch_func(step):
     # A batch of batches, with one of them shared by all.
     nested = torch.func.vmap(lambda a: step(states, a).rewards)(torch.stack([actions, -actions]))
     torch.testing.assert_close(nested[0], step(states, actions).rewards)
+    assert torch.func.vmap(lambda s, a: step(s, a).rewards)(states[:0], actions[:0]).shape == (0,)
     slope = torch.func.grad(lambda s: step(s, actions[0]).rewards)(states[0])
     torch.testing.assert_close(slope, torch.autograd.grad(step(states[0], actions[0]).rewards, states)[0][0])
     with pytest.raises(NotImplementedError, match="first derivatives only"):
@@ -72,6 +74,11 @@ def test_torch_func(step):
     for forward in (torch.func.jacfwd, torch.func.hessian):
         with pytest.raises(NotImplementedError, match="no forward mode and no second derivatives"):
             forward(lambda s: step(s, actions[0]).rewards)(states[0])
+
+
+def test_a_step_of_a_class(step):
+    found = Step(type(step.task), damping=0.1)
+    assert found.task.scene.damping == 0.1 and type(found.task) is type(step.task)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -335,9 +342,13 @@ def test_errors(step):
         Step("Pendulum-v1")
     with pytest.raises(ValueError, match="options go with an id"):
         Step(step.task, damping=0.1)
+    with pytest.raises(ValueError, match="or as the class itself, its parameters as keywords, got <"):
+        TorchVectorEnv(step.task, 2)
     envs = TorchVectorEnv(IDS[0], 2)
     with pytest.raises(TypeError, match=r"options must be a dict or None, got \[1\]"):
         envs.reset(options=[1])
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        _ = envs.state
     envs.reset(seed=0)
     with pytest.raises(ValueError, match=r"actions must have shape \(2, 1\), got \(3, 1\)"):
         envs.step(torch.zeros(3, 1))

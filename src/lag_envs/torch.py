@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -73,10 +74,10 @@ class Step:
 
     Parameters
     ----------
-    task : str or Task
-        Id of an environment, or ``env.unwrapped.task``.
+    task : str, type or Task
+        Id of an environment, a task's class, or ``env.unwrapped.task``.
     **options
-        Parameters of the environment, if an id is given.
+        Parameters of the environment, if an id or a class is given.
 
     Raises
     ------
@@ -91,13 +92,19 @@ class Step:
     torch.Size([4, 4])
     """
 
-    def __init__(self, task: str | Task, **options: Any) -> None:
-        if options and not isinstance(task, str):
-            raise ValueError(f"options go with an id; the given task has its own, got {sorted(options)}")
-        made: Any = gym.make(task, **options).unwrapped if isinstance(task, str) else None
-        if made is not None and not isinstance(made, LagrangianEnv):
-            raise ValueError(f"{task} has no derivatives: it is not an environment of this package")
-        self.task = _checked_task(task if made is None else made.task)
+    def __init__(self, task: str | type[Task] | Task, **options: Any) -> None:
+        if isinstance(task, str):
+            made: Any = gym.make(task, **options).unwrapped
+            if not isinstance(made, LagrangianEnv):
+                raise ValueError(f"{task} has no derivatives: it is not an environment of this package")
+            task = made.task
+        elif isinstance(task, type) and issubclass(task, Task):
+            task = task(**options)
+        elif options:
+            raise ValueError(
+                f"options go with an id or a class; the given task has its own, got {sorted(options)}"
+            )
+        self.task = _checked_task(task)
         self.model = Model(self.task)
         formulas = self.task.formulas
         self._sizes = len(formulas.state), formulas.actions, formulas.targets
@@ -145,7 +152,7 @@ class TorchVectorEnv:
     recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
     until `detach` cuts them off. No gradient flows across an episode's end. Copies and snapshots have no
     history. If `envs` itself is stepped, reset or set, `state` follows; if that breaks its history, a
-    RuntimeError says so until `detach`.
+    RuntimeError says so until `detach`. Inside `vmap`, `grad` and the like of `torch.func` use `Step`.
 
     On an NVIDIA GPU one kernel takes the whole step, states stay on the GPU, and there are no gradients. In
     float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
@@ -231,11 +238,15 @@ class TorchVectorEnv:
 
         Raises
         ------
+        ResetNeeded
+            Before the first reset; on a GPU they are 0 then.
         RuntimeError
             If the environments are no longer where the history of the states leads.
         """
         if isinstance(self.envs, DeviceEnvs):
             return self.envs.state
+        if self.envs.moment == (0, 0):
+            raise ResetNeeded("call reset() first: no episode has begun")
         if self._moment == (*self.envs.moment, self._state._version):
             return self._state
         state, now = self._state, self.envs.state
@@ -567,18 +578,18 @@ def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> 
     """Apply a function of rows to batches of rows."""
     model, *tensors = given
     n = info.batch_size
-    flat = [
-        (x.expand(n, *x.shape) if dim is None else x.movedim(dim, 0)).flatten(0, 1)
+    batches = [
+        x.expand(n, *x.shape) if dim is None else x.movedim(dim, 0)
         for x, dim in zip(tensors, in_dims[1:], strict=True)
     ]
-    found = function.apply(model, *flat)  # type: ignore[attr-defined]
-    return tuple(x.unflatten(0, (n, len(x) // n)) for x in found), (0,) * len(found)
+    found = function.apply(model, *(x.flatten(0, 1) for x in batches))  # type: ignore[attr-defined]
+    return tuple(x.unflatten(0, batches[0].shape[:2]) for x in found), (0,) * len(found)
 
 
 def _checked_task(task: Any) -> Task:
     """Return a task whose steps are differentiable, or raise a ValueError."""
     if not isinstance(task, Task):
-        raise TypeError(f"task must be an id or a Task, got {task!r:.60}")
+        raise TypeError(f"task must be an id, a class or a Task, got {task!r:.60}")
     name = task.id or type(task).__name__
     if task.formulas.choices:
         raise ValueError(f"{name} has a list of actions to choose from, which have no derivatives")

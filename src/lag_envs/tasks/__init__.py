@@ -46,6 +46,11 @@ def load_task(place: str | type[Any]) -> type[Any]:
     """
     if isinstance(place, type):
         return place
+    if not isinstance(place, str):
+        raise ValueError(
+            f"task must be given as 'module:Class' or as the class itself, its parameters as keywords, "
+            f"got {place!r:.200}"
+        )
     try:
         return resolve(place)
     except Exception as error:
