@@ -613,14 +613,15 @@ class Scene(metaclass=SceneType):
         Warns
         -----
         FitWarning
-            If the data determine a parameter poorly or can hardly tell two apart, or if residuals are larger
-            than the noise or not independent. `Fit.warnings` has the texts.
+            If the data determine a parameter poorly or can hardly tell two apart, if residuals are larger
+            than the noise or not independent, or if units look wrong. `Fit.warnings` has the texts.
 
         Raises
         ------
         ValueError
-            For data that do not determine the parameters, naming these; for a parameter that the scene lacks;
-            for recordings of a wrong shape, with too few values, or with controls that are not finite.
+            For data that do not determine the parameters, naming these; for parameters that grow without
+            bound because the model is wrong; for a parameter that the scene lacks; for recordings of a wrong
+            shape, with too few values, or with controls that are not finite.
         StepRefused
             If the motion cannot be simulated with the initial parameters. A coordinate that was not measured
             is first guessed to be 0; the error then names it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.scenes.fitting.parameters import ENDLESS
 from lag_envs.scenes.fitting.shooting import Shooting
 
 Array = NDArray[np.float64]
@@ -51,7 +52,8 @@ class Determined:
         self._parameters = shooting.parameters
         p, of = len(self._parameters.names), shooting.states_of_residuals()
         values = self._parameters.values(z[:p])
-        self._grown = self._parameters.grown(z[:p]).any()
+        growth = self._parameters.growth(z[:p])
+        self._astray = np.any((growth > ENDLESS) | (self._parameters.logs & (growth < 1.0 / ENDLESS)))
         self._whole = np.where(self._parameters.logs, 1.0, values)  # a change by 100 %, scaled
         derivatives = shooting.jacobian(z)
         by_parameters, by_starts = derivatives[:, :p], derivatives[:, p:]
@@ -101,8 +103,8 @@ class Determined:
             others = len(alone) < len(names)
             remedy = f"Leave {some} out of free, so that {it} {held}, or add" if others else "Add"
             far_off = (
-                f"such values mean that nothing moved, or that {SUSPECTS} is wrong"
-                if self._grown
+                f"such values may mean that nothing moved, or that {SUSPECTS} is wrong"
+                if self._astray
                 else "if that is far off, begin closer to the truth"
             )
             raise ValueError(

@@ -16,7 +16,7 @@ from lag_envs.errors import hint
 from lag_envs.scenes.checks import StepRefused, check_number, check_parameters, shown
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.fitting.determined import SUSPECTS, Determined
-from lag_envs.scenes.fitting.parameters import FreeParameters
+from lag_envs.scenes.fitting.parameters import ENDLESS, FreeParameters
 from lag_envs.scenes.fitting.recordings import (
     Recording,
     doubtful_interval,
@@ -214,7 +214,7 @@ def _determined(shooting: Shooting, z: Array, ranges: Array) -> Determined:
         return Determined(shooting, z, ranges)
     except ValueError as error:
         parameters, p = shooting.parameters, len(shooting.parameters.names)
-        grown = parameters.grown(z[:p])
+        grown = parameters.growth(z[:p]) > ENDLESS
         if not grown.any():
             raise
         try:  # at the first values
@@ -284,7 +284,7 @@ def _doubts_of_parameters(
     fitted: Fit, parameters: FreeParameters, best: Array, errors: Array, converged: bool
 ) -> list[str]:
     """Return warnings about the estimates of the parameters."""
-    texts, names, grown = [], list(fitted.estimates), parameters.grown(best)
+    texts, names, grown = [], list(fitted.estimates), parameters.growth(best) > ENDLESS
     for i, (name, value) in enumerate(fitted.estimates.items()):
         wide = fitted.errors[name] > WIDE * abs(value)
         end = min(parameters.low[i], parameters.high[i], key=lambda end: abs(best[i] - end))

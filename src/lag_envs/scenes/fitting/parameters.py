@@ -65,10 +65,10 @@ class FreeParameters:
         """Return the derivatives of the values with respect to the scaled ones."""
         return np.where(self.logs, self.values(scaled), 1.0)
 
-    def grown(self, scaled: Array) -> NDArray[np.bool_]:
-        """Return whether each value is more than `ENDLESS` times its first one."""
+    def growth(self, scaled: Array) -> Array:
+        """Return the size of each value as a multiple of its first one, or in units if that is 0."""
         first = [abs(getattr(self._scene, name)) or 1.0 for name in self.names]
-        return np.abs(self.values(scaled)) > ENDLESS * np.array(first)
+        return np.abs(self.values(scaled)) / first
 
     def scene(self, scaled: Array) -> Scene:
         """Return the scene with these values of its free parameters."""
