@@ -9,7 +9,7 @@ from lag_envs.tasks import Task
 class BallOnBeam(Scene):
     """A solid ball on a beam that turns about its middle.
 
-    x is the ball's place along the beam, angle the beam's, counter-clockwise from level.
+    x is the ball's position along the beam, and angle is the beam's angle, counter-clockwise from horizontal.
     """
 
     ball_mass: float = parameter(0.1, "kg", above=0.0)
