@@ -339,7 +339,7 @@ def test_the_page_states_the_protocols_numbers():
         f"Percentile bootstrap, {100 * LEVEL:.0f} %, {RESAMPLES:,} samples",
         f"mean scores differ by at most {protocol.TOLERANCE:.0e}".replace("e-0", "e-"),
         f"no more than {protocol.APART:.0%} of the episodes".replace("%", " %"),
-        f"each of its returns may differ by {protocol.PLANNED:.0e}".replace("e-0", "e-"),
+        f"each return of a planner may differ by {protocol.PLANNED:.0e}".replace("e-0", "e-"),
         f"Two policies play {alike.EPISODES} episodes",
         f"differ by less than {alike.ACTIONS:.0e} (root".replace("e-0", "e-"),
         f"of one learner that differ by less than {alike.TWINS:.0e}".replace("e-0", "e-"),

@@ -837,10 +837,10 @@ def test_numbers_in_the_documentation():
     orders = [general.usual_order(dt) for dt in (0.03, 0.1, 0.2)]
     said = [
         f"N is {orders[0]} up to dt = 0.03 s, {orders[1]} up to 0.1 s, else {orders[2]}",
-        f"E_v is {TOLERANCE:.0e} of a size",
-        f"counts as {SMALLEST_SIZE:.0e} at least",
+        f"E_v is {TOLERANCE:.0e} of the size of each velocity",
+        f"counts as at least {SMALLEST_SIZE:.0e}",
         f"up to {TRIES} shorter ones",
         f"refused after {driver.LARGEST_COUNT:,} attempts",
-        f"would fall below {driver.SMALLEST_PART:.0e} of it".replace("e-0", "e-"),
+        f"would be shorter than {driver.SMALLEST_PART:.0e} of the control step".replace("e-0", "e-"),
     ]
     assert [words for words in said if words not in text] == []
