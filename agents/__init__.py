@@ -2,5 +2,5 @@
 
 import time
 
-#: When the command began, after the interpreter's own start [s]; libraries are imported later.
+#: When the command began [s]: after the interpreter's own start and before libraries are imported.
 STARTED = time.perf_counter()

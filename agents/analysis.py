@@ -1,4 +1,4 @@
-"""Statistics of the agents' measurements; figures and page need nothing else."""
+"""Statistics of the agents' measurements: everything that the figures and the page need."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
     Parameters
     ----------
     curves : sequence, each of shape (n, 3)
-        Steps, seconds and result for each seed; interpolated linearly between the points.
+        For each seed its points: steps, seconds and result. Curves are linear between the points.
     column : int
         The abscissa: 0 steps, 1 seconds.
 
     Returns
     -------
     dict or None
-        ``x``, ``value``, ``low`` and ``high``, over the part that all curves have in common; without an
-        interval for a single seed. None if there is no such part.
+        ``x``, ``value``, ``low`` and ``high``, over the part that all curves have in common; a single seed
+        has no interval. None if the curves have no common part.
     """
     tables = [np.array(c, np.float64).reshape(-1, 3) for c in curves]
     if not tables or any(len(t) < 2 for t in tables):
@@ -57,7 +57,7 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
 
 
 def first_reached(curve: Iterable[Sequence[float]], level: float, clock: int = 1) -> float | None:
-    """Return when a curve first reached a level; None for never.
+    """Return when a curve first reached a level; None if it never did.
 
     The last number of each point is its score; `clock` selects the result: 0 steps, 1 seconds.
     """
@@ -85,7 +85,7 @@ def times_to_levels(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
 
 
 def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
-    """Return everything that figures and page need for one environment.
+    """Return everything that the figures and the page need for one environment.
 
     Parameters
     ----------
@@ -93,7 +93,8 @@ def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
         For each agent its ``name``, ``kind``, ``conditions`` (by name, the returns of each of its policies),
         and for learners ``seeds``, ``steps``, ``seconds`` and ``curves`` (one for each seed), ``trained_on``.
     scale : Scale, optional
-        Mean return of the random and of the best known policy. Results are scores then, else returns.
+        Mean returns of the random and of the best known policy. With a scale, results are scores; without
+        one, returns.
     """
 
     def scored(returns: ArrayLike) -> Array:
@@ -129,8 +130,8 @@ def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
 def level(conditions: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array]]:
     """Make returns from fewer episodes comparable with those from all episodes.
 
-    Some episodes are easier than others. So the returns are corrected by the difference between the same
-    policy's return in these episodes and in all of them, both without the condition.
+    Some episodes are easier than others, so the returns are corrected: by the difference between the policy's
+    mean return in these episodes and in all episodes, both without the condition.
     """
     nominal = [np.asarray(g, np.float64) for g in conditions[NOMINAL]]
     found = {}
@@ -148,7 +149,7 @@ def best_first(agents: Mapping[str, Data]) -> dict[str, Data]:
 
 
 def chances_of_improvement(agents: Mapping[str, Data]) -> Data:
-    """Return for each learner the probability that a run of it is better than a policy of another agent."""
+    """Return for each learner the probability that one of its runs is better than another agent's policy."""
     found: dict[str, Data] = {}
     each = {
         name: np.array(agent["conditions"][NOMINAL]["each"]) for name, agent in best_first(agents).items()
@@ -165,7 +166,7 @@ def chances_of_improvement(agents: Mapping[str, Data]) -> Data:
 
 
 def summarise_learners(envs: Mapping[str, Data]) -> Data:
-    """Return each learner's interquartile mean over the environments with a score, which are the strata."""
+    """Return each learner's interquartile mean over all environments with a score; they are the strata."""
     scores: dict[str, dict[str, list[float]]] = {}
     for env_id, env in envs.items():
         for name, agent in env["agents"].items() if env["known"] else ():

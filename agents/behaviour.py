@@ -1,8 +1,8 @@
 """How agents act: arrival times, final errors, speeds at a line.
 
-``python -m agents.behaviour`` plays the episodes of `docs/agents.md`, with the quick controllers and with our
-learned policies that are verified on the board. It writes ``agents/results/behaviour.json``, from which
-``python -m agents.results --redraw`` makes that page's tables.
+``python -m agents.behaviour`` plays the episodes of `docs/agents.md` with the quick controllers and with
+those of our learned policies that are verified on the board. It writes ``agents/results/behaviour.json``,
+from which ``python -m agents.results --redraw`` makes that page's tables.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ EPISODES = 1_000
 
 
 def arrival(what: str, played: Episodes) -> dict[str, float | None]:
-    """Measure when the board's goal is reached for good, and the reward lost before and after that.
+    """Measure when the board's goal is reached for good, and how much reward is lost before and after.
 
-    The loss of a step is 1 minus its reward. Means are over the episodes in which the goal holds at the end,
-    None if it never does; the others are counted.
+    The loss of a step is 1 minus its reward. Means are taken over the episodes in which the goal holds at the
+    end (None if there are no such episodes); the other episodes are counted.
     """
     seconds = played.settled()
     well = np.isfinite(seconds)
@@ -53,7 +53,7 @@ def arrival(what: str, played: Episodes) -> dict[str, float | None]:
 
 
 def measures(played: Episodes) -> dict[str, float | None]:
-    """Return the measures of episodes: the arrival at the goal, and the task's own measures."""
+    """Return what is measured in episodes: the arrival at the goal, and the task's own measures."""
     task = played.task
     found = arrival(task.goal.arrival, played) if task.goal and task.goal.arrival else {}
     return found | dict(task.behaviour(played))

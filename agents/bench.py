@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
         f"Compare our vector environment for Stable-Baselines3 with DummyVecEnv, on {ENV}.",
         "examples:\n  python -m agents.bench\n  python -m agents.bench --output adapter.json",
     )
-    p.add_argument("--rounds", type=int, default=15, help="samples of each (default %(default)s)")
+    p.add_argument("--rounds", type=int, default=15, help="samples per measurement (default %(default)s)")
     p.add_argument("--output", type=new_file, metavar="FILE", help="keep all samples as JSON")
     return p
 
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Contestant(k, ENV, "step", n, partial(prepared_steps, f, n)) for n in SIZES for k, f in kinds.items()
     ]
     learn = [Contestant(k, ENV, "PPO", TRAINED, partial(training, f)) for k, f in kinds.items()]
-    # A sample of training is at least one roll-out with its updates, however short a sample is requested.
+    # However short a sample is requested, a sample of training has at least one roll-out with its updates.
     complete = measure_rates(steps, args.rounds, 0.1) and measure_rates(learn, args.rounds, 0.1)
     rows = [
         rates_and_ratio(adapter, dummy) for adapter, dummy in zip(*[iter(steps + learn)] * 2, strict=True)
@@ -76,7 +76,7 @@ def make_adapter(n: int) -> Any:
 
 
 def dummy(n: int) -> Any:
-    """Make Stable-Baselines3's over single environments."""
+    """Make Stable-Baselines3's vector environment over single environments."""
     import gymnasium as gym
     from stable_baselines3.common.vec_env import DummyVecEnv
 

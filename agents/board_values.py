@@ -1,7 +1,8 @@
 """Coarse value functions for the leaderboard's page: ``python -m agents.board_values [ID ...]``.
 
-Writes ``leaderboard/values/ID.json``: the largest attainable return at the start of an episode, over two
-entries of the state; the others are 0, and so is the target. Coarse grids are enough for a picture.
+Writes ``leaderboard/values/ID.json``: the largest attainable return at the start of an episode, as a function
+of two entries of the state, with the other entries and the target at 0. Coarse grids are enough for a
+picture.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
     -------
     dict
         ``axes``: two dicts with the state's name as ``label``, and ``low``, ``high``, ``n``; ``values``: n
-        rows of n numbers, by the first axis. The lowest values are made equal, so that the others can be
-        told apart.
+        rows of n numbers, by the first axis. The lowest values are made equal, so that the other values can
+        be told apart in the picture.
     """
     source, problem = solved_for(env_id)
     solution = Solution(source, problem.levels[0], folder, quiet=True)

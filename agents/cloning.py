@@ -1,8 +1,8 @@
 """Cloning a controller in one file: a network learns the controller's action in every state that it reaches.
 
-It needs no reward, and is at best as good as its expert. In each iteration the network acts, the controller
-labels the states (`Learner.collect`), and the network learns by regression from all data collected so far
-(`Learner.update`). The algorithm is DAgger [1]_.
+Cloning needs no reward, and the network becomes at best as good as the controller. In each iteration the
+network acts, the controller labels the states (`Learner.collect`), and the network learns by regression from
+all data collected so far (`Learner.update`). The algorithm is DAgger [1]_.
 
 References
 ----------
@@ -35,7 +35,7 @@ class Settings(LearnerSettings):
 
     learner = NAME
 
-    controller: str = Field(description="name of the controller; empty: the first that acts without a plan")
+    controller: str = Field(description="name of the controller; empty: the first that needs no plan")
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
     n_envs: Count = Field(description="environments stepped together")
     n_steps: Count = Field(description="steps of each environment between updates")
@@ -58,12 +58,12 @@ class Learner:
     seed : int
         Decides everything that is random.
     steps : int
-        Steps to train for; with them the learning rate is 0.
+        Steps to train for; after them the learning rate is 0.
 
     Raises
     ------
     UserError
-        For an environment whose actions are choices, and for one without such a controller.
+        If the environment has discrete actions, or no controller that acts without a plan.
     """
 
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:

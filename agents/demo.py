@@ -42,14 +42,14 @@ from lag_envs.tasks.registration import make_task
 
 EPISODES = 20
 EPILOG = """files in the output folder:
-  model.zip            the policy: give the folder to agents.learners.load_policy
+  model.zip            the policy; agents.learners.load_policy takes the folder
   learning_curve.png   returns while training, beside the controllers and the random policy
   episode.mp4          one fresh episode of the trained policy
   comparison.json      returns and scores of all agents on the same fresh episodes
   result.json          the training: returns, learning curve, hyperparameters, versions and times
-  tensorboard/         for `tensorboard --logdir FOLDER`, of learners of Stable-Baselines3
+  tensorboard/         for `tensorboard --logdir FOLDER`; only for learners of Stable-Baselines3
 
-Re-run it to resume where it was interrupted; a finished run is evaluated again.
+Re-run an interrupted command to resume it; a finished run is only evaluated again.
 
 examples:
   python -m agents.demo                                  train on PivotedBar-v0, in seconds
@@ -67,11 +67,11 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--env", default="PivotedBar-v0", metavar="ENV",
-        help="id, module:ID or FILE, whose code is run (default %(default)s)",
+        help="id, module:ID or FILE; code in it is run (default %(default)s)",
     )  # fmt: skip
     p.add_argument("--algo", default="fast_ppo", help=f"{', '.join(LEARNERS)} (default %(default)s)")
     p.add_argument("--seed", type=int, default=0, help="seed of training (default %(default)s)")
-    p.add_argument("--steps", type=int, help="environment steps to train for, in all")
+    p.add_argument("--steps", type=int, help="environment steps to train for, in total")
     p.add_argument(
         "--output", type=new_folder, default="runs/demo", metavar="FOLDER", help="default %(default)s"
     )
@@ -113,7 +113,7 @@ def open_run(args: argparse.Namespace) -> Run:
         run.remove()
     elif run.load_result() is None and run.load_checkpoint() is None and run.foreign():
         raise UserError(
-            f"{args.output} holds files but no run; choose another --output, or use it with --new"
+            f"{args.output} holds files but no run; choose another --output, or add --new to use this folder"
         )
     return run
 
@@ -163,7 +163,7 @@ def report(run: Run, video: bool) -> None:
 
 
 def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str, np.ndarray]) -> None:
-    """Draw the returns over the steps of training, beside the other agents' means."""
+    """Draw the returns over the steps of training, together with the other agents' means."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")

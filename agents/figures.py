@@ -16,11 +16,11 @@ from agents.learners import learner_label
 from agents.report import brief, meaningful_digits
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 
-#: Okabe and Ito's colours, which the colour-blind can tell apart.
+#: Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLOURS = {"learned": "#0072B2", "classical": "#D55E00", "optimal": "#000000"}
 MARKS = {"learned": "o", "classical": "s", "optimal": "D"}
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-#: Scores below this are drawn at the edge, with their number.
+#: Scores below this are drawn at the edge, with the score as a number.
 LOWEST = -0.1
 
 
@@ -59,7 +59,7 @@ def _figure(width: float, height: float) -> Any:
 def _panels(
     envs: Mapping[str, Data], heights: Sequence[float] | None = None, columns: int = 2
 ) -> tuple[Any, list[Any]]:
-    """Return a figure and a panel for each environment, some beside each other."""
+    """Return a figure and a panel for each environment; several panels share a row."""
     tall = heights or [5.2 / columns] * len(envs)
     ratios = [max(tall[i : i + columns]) for i in range(0, len(envs), columns)]
     figure = _figure(10.0, sum(ratios) + 0.3)
@@ -77,7 +77,7 @@ def _what(env: Data) -> str:
 
 
 def scores_figure(envs: Mapping[str, Data]) -> Any:
-    """Draw each agent's result, with the result of acting ten times as often beside it."""
+    """Draw each agent's result, and next to it the result when the agent acts ten times as often."""
     figure, axes = _panels(envs, [0.9 + 0.3 * len(env["agents"]) for env in envs.values()])
     for ax, env in zip(axes, envs.values(), strict=True):
         lowest = LOWEST if env["known"] else _lowest(env["agents"])
@@ -177,7 +177,7 @@ def improvement_figure(envs: Mapping[str, Data]) -> Any:
     shown = {env_id: env for env_id, env in envs.items() if env["improvement"]}
     figure, axes = _panels(shown, [1.4 + 0.3 * len(env["improvement"]) for env in shown.values()])
     for ax, env in zip(axes, shown.values(), strict=True):
-        # Whoever learned anything is better than no control and random control.
+        # Every agent that learned anything is better than no control and random control.
         named = ((name, brief(name, agent)) for name, agent in env["agents"].items())
         names = {name: short for name, short in named if name not in ("zero", "random")}
         rows = [names[row] for row in env["improvement"]]

@@ -1,6 +1,6 @@
 """Learners of Stable-Baselines3: hyperparameters, environments, interruptible training, policies.
 
-Learners with their own files are called from here too, so that commands can treat all learners alike.
+Our own learners, each in its own file, are called from here too, so that commands treat all learners alike.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from lag_envs.store import write_file
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.registration import make_task
 
-#: The place of each learner's class.
+#: Where each learner's class is found.
 ALGORITHMS = {name: place[:2] for name, place in export.ALGORITHMS.items() if name != "a2c"}
 #: Learners of our own: the module that trains each, and its name in tables.
 OWN = {
@@ -59,15 +59,16 @@ OWN = {
     "cloning": ("agents.cloning", "cloning"),
 }
 LEARNERS = (*ALGORITHMS, *OWN)
-#: Learners whose policies get better and worse: the one that did best in a test is kept, not the last.
+#: Learners whose policies get better and worse: the policy that did best in a test is kept, not the last one.
 KEEP_BEST = (*OFF_POLICY, "dqn")
-#: Episodes of a test while training, and of the evaluation at the end.
+#: Episodes of each test during training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100
-#: Tests, and so points of the learning curve and checkpoints, of one run.
+#: Tests of one run; each gives a point of the learning curve and a checkpoint.
 TESTS = 16
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 SCALE = "lag_envs.sb3.ScaledReward"
-#: Numbers of environments, of steps between updates, and of frames: more would hardly fit into any memory.
+#: Upper limits of the numbers of environments, steps between updates, and frames: more would hardly fit into
+#: memory.
 Count = Annotated[int, Field(ge=1, le=100_000)]
 #: The argument of each wrapper that is known, and its type.
 WRAPPERS: Mapping[str, tuple[str, Any]] = {
@@ -75,14 +76,15 @@ WRAPPERS: Mapping[str, tuple[str, Any]] = {
     DISCRETISE: ("bins", Annotated[int, Field(ge=2, le=1000)]),
     SCALE: ("factor", float),
 }
-#: The Zoo's hyperparameters that are not arguments of a learner's class; with their types, if numbers.
+#: The Zoo's hyperparameters that are not arguments of a learner's class, with their types if they are
+#: numbers.
 ZOO: Mapping[str, Any] = dict.fromkeys(
     ("n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "noise_type")
 ) | {"n_envs": Count, "noise_std": float, "frame_stack": Count}
-#: Arguments of a learner's class, and of `VecNormalize`, that are no hyperparameters.
+#: Arguments of a learner's class, and of `VecNormalize`, that are not hyperparameters.
 GIVEN = ("env", "seed", "device", "tensorboard_log", "action_noise", "_init_setup_model")
 GIVEN_TO_NORMALISE = ("venv", "gamma")
-#: A training with a larger weight has diverged.
+#: A training has diverged if one of the weights is larger than this.
 LARGEST_WEIGHT = 1e6
 #: Libraries whose versions are stored in a result.
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
@@ -112,7 +114,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
     Raises
     ------
     UserError
-        For an unknown algorithm, or a file without readable entry for the environment.
+        For an unknown algorithm, or a file without a readable entry for the environment.
     """
     known_name("algorithm", algo, LEARNERS)
     if file is None:
@@ -125,7 +127,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
         raise UserError(f"{file} cannot be read: {error}") from error
     form = f"`lag-envs hyperparams {algo}` prints the form"
     if not isinstance(entries, dict):
-        raise UserError(f"{file} must map ids to hyperparameters, it is a {type(entries).__name__}; {form}")
+        raise UserError(f"{file} must map ids to hyperparameters, got a {type(entries).__name__}; {form}")
     if env_id not in entries:
         raise UserError(f"{file} has no entry for {env_id}, only for {', '.join(map(str, entries))}; {form}")
     entry = entries[env_id]
@@ -139,7 +141,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
 
 
 def check_hyperparameters(algo: str, hyperparameters: Mapping[str, Any]) -> None:
-    """Raise a UserError for a missing or unknown hyperparameter, or one of another type."""
+    """Raise a UserError for a missing or unknown hyperparameter, or one of the wrong type."""
     if algo in OWN:
         import_module(OWN[algo][0]).Settings.of(hyperparameters)
         return
@@ -162,13 +164,13 @@ def check_hyperparameters(algo: str, hyperparameters: Mapping[str, Any]) -> None
 
 
 def types_of(function: Any, given: Iterable[str]) -> dict[str, Any]:
-    """Return the types of a function's arguments, by name, without those that are given."""
+    """Return the types of a function's arguments, by name, leaving out the named ones."""
     arguments = inspect.signature(function).parameters
     return {name: a.annotation for name, a in arguments.items() if name not in given}
 
 
 def check_arguments(owner: str, values: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    """Raise a UserError for an unknown argument, or one of another type, if its type is a plain one."""
+    """Raise a UserError for an unknown argument, or for one of the wrong type if its type is a simple one."""
     for name, value in values.items():
         if name not in known:
             raise UserError(f"{owner} has no hyperparameter {name!r}; {hint(str(name), known)}")
@@ -177,7 +179,7 @@ def check_arguments(owner: str, values: Mapping[str, Any], known: Mapping[str, A
 
 
 def check_type(name: str, value: Any, kind: Any) -> None:
-    """Raise a UserError for a value of another type."""
+    """Raise a UserError for a value of the wrong type."""
     try:
         checked(TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False)), value)
     except ValueError as error:
@@ -185,7 +187,7 @@ def check_type(name: str, value: Any, kind: Any) -> None:
 
 
 def asked_wrappers(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the argument of each wrapper that is asked for, or raise a UserError."""
+    """Return the argument of each requested wrapper, or raise a UserError."""
     asked: dict[str, Any] = {}
     for key in ("env_wrapper", "vec_env_wrapper"):
         wrappers = hyperparameters.get(key) or []
@@ -220,9 +222,9 @@ def check_suits(algo: str, env_id: str) -> None:
 
 
 def check_trainable(algo: str, env_id: str) -> None:
-    """Raise a UserError for a learner and an environment that do not go together."""
+    """Raise a UserError for a learner that cannot be used with an environment."""
     single = trainable(env_id).formulas.actions == 1
-    if not (algo == "dqn" and single):  # it splits a continuous control into bins
+    if not (algo == "dqn" and single):  # DQN splits a continuous control into bins
         check_suits(algo, env_id)
 
 
@@ -264,14 +266,14 @@ def trainable(env_id: str) -> Task:
 
 
 def make_envs(run: Run, normalise: Any = None) -> Any:
-    """Return the native vector environment with the wrappers that the hyperparameters ask for.
+    """Return the native vector environment with the wrappers that the hyperparameters name.
 
     Parameters
     ----------
     run : Run
         The run.
     normalise : VecNormalize, optional
-        The normalisation to continue with, without environments, in place of a new one.
+        A saved normalisation, without its environments, to continue with in place of a new one.
     """
     from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
@@ -311,7 +313,7 @@ def make_model(run: Run, envs: Any) -> Any:
 
     # The networks are too small for several threads: a second one costs more than it gains.
     torch.set_num_threads(1)
-    # A copy, for learners write into what they are given.
+    # A copy, because learners change the dict that they are given.
     arguments = deepcopy({k: v for k, v in run.hyperparameters.items() if k not in ZOO})
     for name in ("learning_rate", "clip_range"):
         if isinstance(arguments.get(name), str):  # "lin_3e-4" falls to zero in the course of the training
@@ -345,7 +347,7 @@ def make_model(run: Run, envs: Any) -> Any:
 
 
 def freeze(model: Any) -> dict[str, Any]:
-    """Return the files that Stable-Baselines3 saves of a training: learner, normalisation, replay buffer."""
+    """Return the files in which Stable-Baselines3 saves a training: learner, normalisation, replay buffer."""
     file = io.BytesIO()
     model.save(file)
     return {
@@ -367,7 +369,7 @@ def thaw(run: Run, content: Mapping[str, Any]) -> Any:
         model = learner(run.algo).load(
             io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log, **export.LOADING
         )
-    except Exception as error:  # whatever a damaged file leads to
+    except Exception as error:  # a damaged file can raise anything
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"{run.path(CHECKPOINT)} cannot be read ({reason}); --new starts over") from error
     if buffer is not None:
@@ -387,7 +389,7 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
     run : Run
         The run; it continues from its checkpoint, if there is one.
     show : callable
-        Called often, with the run.
+        Called often during training, with the run as argument.
     tested : callable
         Called after each test of the policy, when its checkpoint has been written.
     """
@@ -402,12 +404,12 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
     model = make_model(run, make_envs(run)) if content is None else thaw(run, content)
     best = content and content["best"]
     model.get_env().reset()  # compiles
-    # Every seed has different episodes throughout, and so does a resumed run.
+    # The episodes of every seed are different throughout, and so are those of a resumed run.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
     every = run.steps / TESTS
 
     class Watch(BaseCallback):
-        """Test and save now and then."""
+        """Test and save at intervals."""
 
         last = run.trained
 
@@ -422,7 +424,7 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             return True
 
         def _on_rollout_start(self) -> None:
-            # Here the learner has already been updated from the last roll-out.
+            # At this point the learner has already been updated from the last roll-out.
             if not run.curve or self.num_timesteps - self.last >= every:
                 self.keep()
 
@@ -459,21 +461,21 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
 
 
 def tested_return(env_id: str, policy: Any) -> float:
-    """Return a policy's mean return in the episodes of a test while training."""
+    """Return a policy's mean return in the episodes of a test during training."""
     returns = play(env_id, policy, range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES))
     check_rewards(env_id, returns)
     return float(returns.mean())
 
 
 def check_rewards(env_id: str, rewards: NDArray[Any]) -> None:
-    """Raise a UserError for a reward that is not a finite number; the learner would seem to diverge."""
+    """Raise a UserError for a reward that is not finite; otherwise the learner would seem to diverge."""
     wrong = rewards[~np.isfinite(rewards)]
     if wrong.size:
         raise UserError(f"the reward of {env_id} is {wrong[0]}; it must be a finite number in every state")
 
 
 def check_weights(run: Run, weights: Iterable[Any], error: Exception | None = None) -> None:
-    """Raise a UserError, from what this led to, if a tensor of weights shows that a training diverged."""
+    """Raise a UserError, from the given error, if a tensor of weights shows that a training diverged."""
     if not all((w.detach().abs() < LARGEST_WEIGHT).all() for w in weights):
         raise UserError(
             f"the training diverged (seed {run.seed}, after {run.trained:,} steps): lower learning_rate"
@@ -483,7 +485,7 @@ def check_weights(run: Run, weights: Iterable[Any], error: Exception | None = No
 def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
     """Train with a learner of our own.
 
-    Tests on the way show the progress. They neither stop the training nor select the policy that is kept.
+    Tests during the training show its progress. They neither stop it nor select the policy that is kept.
     """
     content = run.load_checkpoint()
     module = import_module(OWN[run.algo][0])
@@ -491,7 +493,7 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
     if content is not None:
         try:
             learner.restore(content["learner"])
-        except Exception as error:  # another environment, or version of the learner, may lead to anything
+        except Exception as error:  # anything: another environment, another version of the learner
             raise UserError(
                 f"{run.path(CHECKPOINT)} cannot be resumed ({error}); --new starts over"
             ) from error
@@ -533,7 +535,7 @@ def finish_training(run: Run, best: Mapping[str, Any]) -> None:
 
 
 def evaluate_finished(run: Run, policy: Any, kept: int) -> None:
-    """Evaluate a finished training's policy after some of its steps, on fresh episodes; write the result."""
+    """Evaluate the policy of a finished training on fresh episodes, and write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
     check_rewards(run.env, returns)
@@ -592,7 +594,7 @@ def load_policy(folder: str | Path) -> Any:
         model = learner(result["algo"]).load(folder / MODEL, device="cpu", **export.LOADING)
         file = folder / NORMALISATION
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None
-    except Exception as error:  # whatever a damaged file leads to
+    except Exception as error:  # a damaged file can raise anything
         reason = f"{type(error).__name__}: {error}"
         raise UserError(
             f"the policy in {folder} cannot be read ({reason}); train it again, with --new"

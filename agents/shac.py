@@ -4,16 +4,17 @@ The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so n
 each iteration the policy acts for a window of some steps (`Learner.collect`), the derivatives of all later
 rewards in the window with respect to each action are computed (`Learner.gradients`), and the policy follows
 the gradient (`Learner.update`). A critic estimates the rewards after the window. Without a critic, and with
-windows as long as episodes, it is back-propagation through time, also called analytic policy gradients.
+windows as long as episodes, the method is back-propagation through time, also called analytic policy
+gradients.
 
-The algorithm follows [1]_, but differs in more than details:
+The algorithm follows [1]_, with notable differences:
 
 - At each step, derivatives larger than `max_slope` are scaled back to it.
-- The policy is deterministic, not a normal distribution: nothing is explored but what starts and kicks bring.
+- The policy is deterministic, not a normal distribution: only starts and kicks bring exploration.
 - Actions beyond their limits are clipped, and moved back towards them, never further out.
 - Each action follows the gradient of the rewards after it, discounted from that action on. In [1]_ they are
   discounted from the window's start, so that late actions in a window count less.
-- The critic's targets are its own values; [1]_ takes them from a copy that follows slowly.
+- The critic's targets are computed from its own values; in [1]_, from those of a copy that follows slowly.
 - A share of the episodes starts in random states (`random_starts`).
 
 For PyTorch a window is one batch. The derivatives of all its steps are computed at once, because the states
@@ -69,9 +70,9 @@ class Settings(LearnerSettings):
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
     critic: list[PositiveInt] = Field(description="widths of the critic's hidden layers; empty: no critic")
     critic_rate: float = Field(ge=0, description="learning rate of the critic")
-    critic_epochs: int = Field(ge=1, description="passes over a window in which the critic learns")
-    batch_size: int = Field(ge=1, description="steps of a minibatch of these")
-    td_lambda: float = Field(ge=0, le=1, description="decay of the weights of later steps in its targets")
+    critic_epochs: int = Field(ge=1, description="passes over a window, in each of which the critic learns")
+    batch_size: int = Field(ge=1, description="steps of a minibatch of the critic")
+    td_lambda: float = Field(ge=0, le=1, description="decay of later steps' weights in its targets")
 
     @model_validator(mode="after")
     def _fit(self) -> Self:
@@ -109,7 +110,7 @@ class Learner:
     seed : int
         Decides everything that is random.
     steps : int
-        Steps to train for; with them the learning rate is 0.
+        Steps to train for; after them the learning rate is 0.
 
     Raises
     ------
@@ -192,16 +193,17 @@ class Learner:
     def gradients(self, w: ExperienceWindow) -> Array:
         """Differentiate the discounted rewards that follow an action with respect to it, (T, n, n_actions).
 
-        They are with respect to the clipped actions. For an episode that is cut, the critic stands for the
-        rest. Backwards in time, the derivatives with respect to x and a, a step's state and action, follow
-        from those with respect to the next ones, x' and a', where a' depends on the observation o'(x'):
+        The derivatives are with respect to the clipped actions. If an episode is cut, the critic's value
+        stands for the rest of it. Let x and a be a step's state and action, x' and a' the next ones, where a'
+        depends on the observation o'(x'). Backwards in time, the derivatives with respect to x and a follow
+        from those with respect to x' and a':
 
             d/d(x, a) = ∂r/∂(x, a) + γ (d/dx' · ∂x'/∂(x, a) + d/da' · ∂a'/∂o' · ∂o'/∂(x, a))
 
-        The factors here are known for all steps beforehand, and computed at once.
+        The partial derivatives on the right are known for all steps beforehand, and are computed at once.
         """
         (steps, n, wide), many, gamma = w.before.shape, w.actions.shape[2], self.settings.gamma
-        going = ~w.over  # where the next step is one of the window
+        going = ~w.over  # whether the next step is in the window
         going[-1] = False
         # The differentiated results of a step: each entry of the next state, each next action, and
         # the reward, together with the critic's value if no step follows.
@@ -231,7 +233,8 @@ class Learner:
     def through_step(self, w: ExperienceWindow, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:
         """Convert gradients with respect to steps' results to those with respect to their states and actions.
 
-        Each step has several, given as (kinds, T, n, ...), returned as (kinds, T, n, n_state + n_actions).
+        Each step has several gradients, given as (kinds, T, n, ...), returned as (kinds, T, n, n_state +
+        n_actions).
         """
         kinds, task = len(by_rewards), self.task
 
@@ -251,13 +254,13 @@ class Learner:
         return both.reshape(kinds, *w.rewards.shape, -1)
 
     def clipped(self, actions: NDArray) -> Array:
-        """Return actions as the environment takes them."""
+        """Return the actions in the form that the environment takes."""
         return np.clip(actions, -self.policy.largest, self.policy.largest).astype(np.float64)
 
     def update(self, w: ExperienceWindow, by_actions: Array) -> None:
         """Move the policy along the gradient.
 
-        Actions beyond the largest one are moved back, never further out.
+        Actions beyond their limits are moved back, never further out.
         """
         outwards = (w.actions != self.clipped(w.actions)) & (by_actions * w.actions > 0.0)
         wanted = np.where(outwards, 0.0, by_actions / w.rewards.size).astype(np.float32)
