@@ -1,4 +1,4 @@
-"""The agents to measure, the conditions, and measurements, each stored as soon as it is done."""
+"""The agents to measure, the conditions, and the measurements; each is stored as soon as it is done."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class Entrant:
     make : callable
         Returns the policy; takes no arguments.
     mark : str
-        Changes with everything that determines how the policy acts.
+        A text that changes with everything that determines how the policy acts.
     run : dict, optional
         The contents of ``result.json``, for a learner.
     plans : bool
-        Whether it plans before each episode, which takes long.
+        Whether the policy plans before each episode, which takes long.
     """
 
     env: str
@@ -84,7 +84,7 @@ class Entrant:
 
 
 def no_optimum(env_id: str) -> str:
-    """Return why there is no optimal policy; empty if there is one."""
+    """Return why there is no optimal policy; an empty text if there is one."""
     if env_id not in played():
         return "value iteration gives no policy here"
     if not (RESULTS / f"{env_id}.json").exists():
@@ -95,7 +95,8 @@ def no_optimum(env_id: str) -> str:
 def _policy(env_id: str, folder: Path) -> Any:
     """Return a learner's policy as the board plays it.
 
-    A model of Stable-Baselines3 acts like it only to float32's rounding, which chaotic motion amplifies.
+    A model of Stable-Baselines3 agrees with that policy only to float32's rounding, which chaotic motion
+    amplifies.
     """
     import torch
 
@@ -120,7 +121,7 @@ def learned_policy(env_id: str, folder: Path) -> Entrant:
 
 
 def check_alike(entrant: Entrant, first: Entrant) -> None:
-    """Raise a UserError if runs were trained differently: they are not samples of the same learner."""
+    """Raise a UserError if runs were trained differently, as they are then not of the same learner."""
     assert entrant.run is not None and first.run is not None
     for name in ("steps", "hyperparameters"):
         if entrant.run[name] != first.run[name]:
@@ -182,7 +183,7 @@ class Evaluation:
     absent, broken : list of str
         Agents that are missing, and agents with a problem.
     returns : dict of str to list of float
-        By the key of a `MeasurementJob`.
+        The returns of each `MeasurementJob`, by its key.
     noise : ndarray, shape (n_observation,)
         Scale of the observation noise.
     """
@@ -237,7 +238,7 @@ class Evaluation:
         episodes : int
             Number of episodes.
         changed : int, optional
-            Largest number under changed conditions; by default `PLANNED` for agents that plan.
+            Largest number of episodes under changed conditions; by default `PLANNED` for agents that plan.
         """
 
         def count(entrant: Entrant, condition: Condition) -> int:
@@ -287,7 +288,7 @@ class Evaluation:
 
 
 def _timed(run: Data) -> Data:
-    """Return a run with its processor seconds, which other load on the machine hardly affects."""
+    """Return a run with its processor seconds, which other programs on the machine hardly affect."""
     wall = run["wall_seconds"]
     seconds = run.get("processor_seconds", wall)  # earlier versions did not count them
     share = seconds / wall if wall else 1.0

@@ -1,4 +1,4 @@
-"""The optimum of every task, computed: value iteration where the state has 2 or 3 dimensions, else bounds.
+"""The optimum of every task: by value iteration if the state has 2 or 3 dimensions, otherwise bounds.
 
 ``python -m agents.optimum --help`` has the options.
 """
@@ -63,18 +63,18 @@ what is written:
 how to read the numbers:
   grid value    mean of V_0 over the starts of 1,000 fixed episodes. Interpolation makes it too large or too
                 small; the finer the grid, the smaller the error.
-  lower         mean return that the greedy policy really gets in those episodes, with the 95 % confidence
-                interval of a mean. A policy that gets it exists: the optimum is not below.
+  lower         mean return that the greedy policy gets in those episodes, with the 95 % confidence
+                interval of the mean. Since a policy attains it, the optimum is not below it.
   estimate      grid values extrapolated to zero cell width, by the order of convergence that the last three
-                show; its error bar is the change by the last halving of the cells. It is an ESTIMATE, not a
-                bound. There is none if its own greedy policy gets more.
+                show; its error bar is how much the last halving changed it. It is an ESTIMATE, not a
+                bound. No estimate is given if the greedy policy gets more.
   bound         proved upper bound on the return of any policy; crude unless the optimum is known.
 For a task with plans (`Task.plans`), plans are found instead, by iLQR from random guesses, in minutes per id:
   src/lag_envs/controllers/plans/ID-followed.npz
                 a plan that is followed from any start by feedback; of those found, the one with the best
                 mean return over 200 fresh starts
   src/lag_envs/controllers/plans/ID-quick.npz
-                a quicker one, from which each episode is replanned
+                a quicker plan, from which each episode is replanned
   src/lag_envs/tasks/measured.json
                 the returns of both, measured by python -m agents.scale: means over fresh starts with standard
                 errors; the better one is the best known return, a lower bound
@@ -82,10 +82,10 @@ With --quick, plans of one seed are written to FOLDER and nothing is measured.
 For a task with neither grid nor plans, python -m agents.scale measures the controllers and the best policy of
 a run, or the one that ships with the package; with --quick nothing is written.
 
-If the state has 4 dimensions, an easier task is solved, such as the one without a track. Its value is an
+If the state has 4 dimensions, an easier task is solved, such as that without a track. Its value is an
 upper bound; lower is the return of the best agent, see the agents' results.
 
-It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): re-run it to resume from there.
+The command can be stopped at any time (Ctrl-C, SIGTERM, or a kill); re-run it to resume.
 
 examples:
   python -m agents.optimum PivotedBar-v0 --quick      one id on coarse grids, in seconds; writes to FOLDER
@@ -113,13 +113,13 @@ def grid(problem: ValueIteration, level: float, target: float | None = None) -> 
 
 
 def solvable() -> dict[str, ValueIteration]:
-    """Return the problems that are solved on their own grid, by id."""
+    """Return the problems that are solved on a grid, by id."""
     found = {env_id: task.value_iteration for env_id, task in TASKS.items()}
     return {env_id: problem for env_id, problem in found.items() if problem and problem.axes}
 
 
 def solved_for(env_id: str) -> tuple[str, ValueIteration]:
-    """Return the id, and the problem, whose solution is that of an environment or bounds it from above."""
+    """Return the id and the problem whose solution solves an environment or bounds it from above."""
     own = TASKS[env_id].value_iteration
     assert own is not None
     source = own.relaxed or env_id
@@ -137,13 +137,13 @@ class Solution:
     Parameters
     ----------
     env_id : str
-        The environment that is solved.
+        Id of the environment that is solved.
     level : float
-        How fine.
+        How fine the grids are.
     folder : Path, optional
         Where the values are cached; None keeps them in memory.
     new : bool
-        Whether to forget what is cached.
+        Whether to discard cached values.
     quiet : bool
         Whether to show no progress.
     problem : ValueIteration, optional
@@ -168,7 +168,7 @@ class Solution:
         self.keep = list(problem.keep or range(self.n_state))
         self.steps = int(self.task.limit)
         self.kick: Kick | None = self._kick if self._kicks() else None
-        #: The last targets, and the nodes of the axis that follows them: they last for an episode.
+        #: The last targets and the nodes of the axis that depends on them; targets last for an episode.
         self._asked: Array = np.empty(0)
         self._own: Array = np.empty((0, 0))
         self.programs, self.values, self.seconds = [], [], 0.0
@@ -211,7 +211,7 @@ class Solution:
         return ends[:, self.keep], rewards, ended
 
     def _kicks(self) -> bool:
-        """Return whether there are random kicks; raise a ValueError for those that `_kick` does not know."""
+        """Return whether there are random kicks; raise a ValueError for kicks that `_kick` does not know."""
         if not self.task.draws:
             return False
         chance, state = self.task.chance(self.problem.chance), np.array([self.task.centre])
@@ -249,7 +249,7 @@ class Solution:
         points : ndarray, shape (n, d)
             States on the grid.
         targets : ndarray, shape (n,), optional
-            Targets, where the task has them.
+            Targets, if the task has any.
         """
         times = np.ascontiguousarray(np.broadcast_to(times, len(points)), np.int64)
         last = len(self.values[0]) - 1
@@ -283,11 +283,11 @@ class Solution:
 
     @property
     def _moving(self) -> int:
-        """Number of the axis whose nodes follow the target."""
+        """Index of the axis whose nodes depend on the target."""
         return [axis.centre for axis in self.problem.axes].index("target")
 
     def _own_nodes(self, targets: Array) -> NDArray[np.intp]:
-        """Return for each target the row of `_own` with the nodes of the axis that follows it."""
+        """Return for each target the row of `_own` whose nodes belong to the target."""
         different, rows = np.unique(targets, return_inverse=True)
         if not np.array_equal(different, self._asked):
             axis = self.problem.axes[self._moving]
@@ -296,7 +296,7 @@ class Solution:
         return rows
 
     def expected(self, times: ArrayLike, points: Array, targets: Array | None = None) -> Array:
-        """Return E V_t over the random kick that follows at points."""
+        """Return the expectation of V_t at points over the random kick that follows."""
         if self.kick is None:
             return self.value(times, points, targets)
         outcomes, weights = self.kick(points)
@@ -311,12 +311,12 @@ class GreedyPolicy(LookAhead):
     env_id : str
         Id of an environment that value iteration solves.
     level : float, optional
-        How fine the grid is; by default the finest that `python -m agents.optimum` uses. Values that are not
-        in the cache are computed, which takes a moment.
+        How fine the grid is; by default as fine as the finest of `python -m agents.optimum`. Values that are
+        not in the cache are computed, which takes a moment.
     folder : Path, optional
         The cache.
     solution : Solution, optional
-        An existing solution, in place of all these.
+        An existing solution, in place of the other arguments.
 
     Examples
     --------
@@ -361,7 +361,7 @@ def starts(env_id: str, episodes: int = EPISODES) -> tuple[Array, Array | None]:
 
 
 def proved_bound(env_id: str) -> tuple[float, str]:
-    """Return an upper bound on any policy's mean return over the starts, and its reason."""
+    """Return an upper bound on any policy's mean return over the starts, and the reason for it."""
     task: Task = TASKS[env_id]()
     if task.optimum is None:
         most = solvable()[env_id].most
@@ -379,10 +379,10 @@ def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
     limit : float
         The limit, by the order of convergence that the last three values show, clipped to between 1 and 2.
     error : float
-        The change by the last halving of the cells. If the order is at least 1, the error on the finest grid
-        is at most this, and a misjudged order moves the limit by less.
+        How much the last halving of the cells changed the value. If the order is at least 1, the error on the
+        finest grid is at most this, and a misjudged order moves the limit by less.
     order : float
-        The order; 1 if there are not three values, or if they do not converge evenly.
+        The order; 1 if there are fewer than three values, or if they do not converge evenly.
 
     Examples
     --------
@@ -558,7 +558,7 @@ def draw_values(env_id: str, folder: Path, file: Path, level: float) -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    p = module_parser("agents.optimum", "Compute the best return that is possible, for every task.", HELP)
+    p = module_parser("agents.optimum", "Compute the best possible return of every task.", HELP)
     p.add_argument("env", nargs="*", metavar="ENV", help="ids of environments (default: all)")
     p.add_argument("--quick", action="store_true", help="coarse grids; everything is written to FOLDER")
     p.add_argument(
@@ -567,7 +567,7 @@ def parser() -> argparse.ArgumentParser:
         default=DEFAULT_FOLDER,
         help="where value functions are kept (default %(default)s)",
     )
-    p.add_argument("--new", action="store_true", help="compute again what is kept there")
+    p.add_argument("--new", action="store_true", help="compute again what is kept in FOLDER")
     return p
 
 
@@ -575,7 +575,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 2 for a mistake of the user's, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    # Tasks that serve as relaxations of others are solved first.
+    # Tasks that are relaxations of other tasks are solved first.
     known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
     last = {env_id for env_id, problem in known.items() if problem and problem.relaxed}
     ids = [check_env(name) for name in args.env] or sorted(TASKS, key=last.__contains__)
@@ -591,11 +591,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def compute_optimum(env_id: str, args: argparse.Namespace) -> None:
     """Compute, write and draw one environment's optimum; if it has no grid, plan instead.
 
-    Without a plan either, the best known policy is a controller or a learner's: its return is measured.
+    If it has no plan either, the best known policy is a controller or a learner's, and its return is
+    measured.
     """
     task = TASKS[env_id]()
     if task.plans is not None or task.value_iteration is None:
-        from agents import plans, scale  # they play what is found here
+        from agents import plans, scale  # the measurements play the plans found here
 
         if task.plans is not None:
             plans.find_plans(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)

@@ -1,4 +1,4 @@
-"""Plans for tasks that no grid can solve: found from random guesses, and selected by their returns.
+"""Plans for tasks that no grid can solve, found from random guesses and selected by their returns.
 
 ``python -m agents.optimum`` calls this for tasks that have `Task.plans`.
 """
@@ -34,7 +34,7 @@ def promising_controllers(env_id: str, seeds: Iterable[int], **changes: Any) -> 
 
 
 def find_plans(env_id: str, folder: Path | None, seeds: Iterable[int]) -> None:
-    """Find an environment's plans, and write them to the place where controllers read them, or into a folder.
+    """Find an environment's plans, and write them to where controllers read them, or into a folder.
 
     One plan is followed from any start: the one with the best mean return over fresh starts. The other is the
     best initial guess if each episode is replanned. A task that follows another's plans has none of its
@@ -59,7 +59,7 @@ def find_plans(env_id: str, folder: Path | None, seeds: Iterable[int]) -> None:
     gains = []
     for agent in guesses:
         planner = replan(task, guesses=[agent])
-        # Each step beyond the plan's end is worth 1, less the cost of the tail.
+        # Each step beyond the plan's end pays 1; the cost of the tail is subtracted.
         gains.append(planner.plan(starts, np.zeros(STARTS))[1].mean() + task.limit - planner.steps)
     guesses[int(np.argmax(gains))].save(plan_file(task, "quick", folder))
     seconds = time.monotonic() - began

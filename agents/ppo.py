@@ -1,10 +1,10 @@
-"""Proximal policy optimisation in one file of plain PyTorch: read it from top to bottom.
+"""Proximal policy optimisation in one file of plain PyTorch, to be read from top to bottom.
 
 ``python -m agents.ppo --help`` has the options. An iteration lets the policy act in all environments
 (`Learner.collect`), estimates how much better each action was than expected (`Learner.advantages`), and
 makes better actions more likely, within limits (`Learner.update`). The algorithm is that of [1]_, with the
 estimator of [2]_ and the exploration of [3]_. Settings, resuming and evaluation are in other files of this
-folder: to copy it, take the folder ``agents``.
+folder, so copy the whole folder ``agents``.
 
 References
 ----------
@@ -147,7 +147,7 @@ class Policy:
         """Return the best action for each observation, as the leaderboard does: in float64, row by row.
 
         `outputs` is faster, but its last bits depend on how many rows there are, and in chaotic motion that
-        decides where an episode ends up. With several frames, the memory is the observations seen.
+        decides where an episode ends up. With several frames, the memory holds the last observations.
         """
         seen = np.asarray(observation, np.float64)
         if self.frames > 1:
@@ -184,8 +184,8 @@ class Policy:
 class GaussianActor:
     """Continuous actions: Gaussian around the actor's outputs, with noise held for some steps.
 
-    The noise is features · E, where E (features, actions) is drawn with a learned standard deviation of each
-    entry. Features are the actor's last hidden layer (gSDE), or 1, so that the noise does not depend on the
+    The noise is features · E, where E (features, actions) is drawn with a learned standard deviation for each
+    entry. The features are the actor's last hidden layer (gSDE), or 1 for noise that does not depend on the
     state. The environment clips actions beyond the action space.
     """
 
@@ -257,7 +257,7 @@ class Learner:
     seed : int
         Decides everything that is random.
     steps : int
-        Steps to train for; with them the learning rate is 0.
+        Steps to train for; after them the learning rate is 0.
     """
 
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
@@ -273,7 +273,7 @@ class Learner:
         )
         first = first_training_seed(seed)
         self.envs.reset(seed=first)
-        # Episodes are under way already; what was observed before is not seen.
+        # Episodes are under way already, and earlier observations are not seen.
         self.observation = stacked(stagger(self.envs, limit, first)[0], settings.frames)
         self.actions, self.shape = formulas.actions, self.envs.action_space.shape
 
@@ -284,7 +284,8 @@ class Learner:
         self.head = (
             CategoricalActor(self.policy) if formulas.choices else GaussianActor(settings, formulas.actions)
         )
-        # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
+        # All parameters lie in one array, and so do their gradients: Adam and the norm then take one call
+        # each.
         parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
         self.parameters = nn.Parameter(torch.cat([p.detach().flatten() for p in parts]))
         self.gradient = self.parameters.grad = torch.zeros_like(self.parameters)
@@ -346,7 +347,7 @@ class Learner:
         return advantages, advantages + values[:-1]
 
     def update(self, found: Experience, advantages: Array, targets: Array) -> None:
-        """Improve actor and critic by some epochs of Adam on the collected experience."""
+        """Improve actor and critic by several epochs of Adam on the collected experience."""
         s, body, last = self.settings, self.actor[:-1], self.actor[-1]
         self.adam.param_groups[0]["lr"] = s.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
         observations = torch.from_numpy(found.observations[:-1].reshape(advantages.size, -1))
@@ -394,9 +395,9 @@ class Learner:
 
 # --- the command --------------------------------------------------------------------------------------------
 
-EPILOG = f"""what is left in FOLDER/ENV/{NAME}/seed<K>:
+EPILOG = f"""files in FOLDER/ENV/{NAME}/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, settings, versions, times
-  model.zip            weights, for numpy.load; the policy: give the folder to agents.learners.load_policy
+  model.zip            weights, for numpy.load; agents.learners.load_policy takes the folder
   {CHECKPOINT}       while the run is not finished: everything needed to resume
 
 The same seed gives the same policy, bit for bit, even if the training was interrupted (by Ctrl-C or by a
@@ -449,7 +450,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     changed = {name: value for name, value in given.items() if value is not None}
     runs = planned_runs(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
-        Settings.of(run.hyperparameters)  # fail now, not after another seed has been trained
+        Settings.of(run.hyperparameters)  # fail now, not after training another seed
     status = train_all(runs, here, "agents.ppo", arguments)
     if status == 0:
         print(

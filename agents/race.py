@@ -1,4 +1,4 @@
-"""Learners side by side on one environment: their scores against the time that training takes.
+"""Learners side by side on one environment: scores against the time that training takes.
 
 ``python -m agents.race --help`` has the options.
 """
@@ -46,15 +46,15 @@ TESTS, EPISODES = 24, 100
 #: Heights of a small curve's characters, for scores from 0 to 1, and how many characters it has.
 HEIGHTS, WIDTH = "▁▂▃▄▅▆▇█", 16
 EPILOG = f"""Trainings run one after the other, each in its own process on one core: every learner with one
-seed, then every learner with the next. So other load on the machine disturbs all learners alike. There are
+seed, then every learner with the next. Other load on the machine so disturbs all learners alike. There are
 two clocks. One counts only training; it stops during the {TESTS} tests on {EPISODES} episodes. The other
 counts the whole process: imports, compiling, training, and one evaluation. Processor time leaves out what
 other programs do.
 
-On a terminal a table shows each training while it runs. One that fails is named, and does not count.
+On a terminal a table shows each training while it runs. A training that fails is named, and does not count.
 
-The time to a score is that of the first test that reaches it; it is infinite for a training that never does.
-The last rows of the table have the scores of the evaluation at the end: the median, and the range.
+The time to a score is the time of the first test that reaches it, or infinite if no test does.
+The last rows of the table have the median and the range of the scores in the evaluation at the end.
 A training that has ended is not started again. Tests do not influence training.
 
 examples:
@@ -65,7 +65,7 @@ examples:
 
 
 class Row(BaseModel):
-    """What a table and a picture need of a training that a file holds."""
+    """What the table and the picture need of a training stored in a file."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "env", nargs="?", default=ENV, metavar="ENV",
-        help="an id of the package: only these have a scale of scores (default %(default)s)",
+        help="an id of the package, as scores need a scale (default %(default)s)",
     )  # fmt: skip
     p.add_argument(
         "--learners", nargs="+", default=["fast_ppo", "ppo"], metavar="NAME",
@@ -92,9 +92,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seeds", type=int, default=5, metavar="N", help="default %(default)s")
     p.add_argument("--first-seed", type=int, default=0, metavar="K", help="default %(default)s")
     p.add_argument("--steps", type=int, metavar="N", help="steps of each training (default: the task's own)")
-    p.add_argument(
-        "--output", type=new_file, metavar="FILE", help="keep each training as a line of JSON; resumes"
-    )
+    p.add_argument("--output", type=new_file, metavar="FILE", help="keep trainings as lines of JSON; resumes")
     p.add_argument("--picture", type=new_picture, metavar="FILE", help="draw scores against time and steps")
     return p
 
@@ -153,7 +151,7 @@ def trainings(args: argparse.Namespace, names: Sequence[str], seeds: range) -> I
 
 
 def earlier_rows(file: Path) -> list[dict[str, Any]]:
-    """Return the trainings that a file holds, or raise a UserError if it holds others' rows.
+    """Return the trainings that a file holds, or raise a UserError if it is of another race.
 
     Lines that are not rows, such as one that was cut off, are named and left out.
     """
@@ -191,7 +189,7 @@ def raced(settings: dict[str, Any], show: Callable[[dict[str, Any]], None]) -> d
     now = settings | {"trained": 0, "seconds": 0.0, "curve": []}
     show(now)
     events = multiprocessing.get_context("spawn").Queue()
-    # The folder is this process's, so that it goes even if the other one is killed.
+    # The folder belongs to this process, so it is removed even if the other process is killed.
     with tempfile.TemporaryDirectory() as folder, workers.processes(1, _begin, events) as submit:
         future = submit(train_seed, settings, Path(folder))
         while not future.done():
@@ -241,19 +239,19 @@ def train_seed(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def live_view() -> Iterator[Callable[[Sequence[dict[str, Any]]], None]]:
-    """Show a table of trainings below what is printed; in a pipe there is none."""
+    """Show a table of trainings below what is printed; no table is shown in a pipe."""
     if not sys.stdout.isatty():
         yield lambda rows: None
         return
     from rich.live import Live
 
     with Live(auto_refresh=False) as live:
-        # The last ones, for the table must fit on the screen.
+        # Only the last ones, as the table must fit on the screen.
         yield lambda rows: live.update(live_table(rows[3 - live.console.height :]), refresh=True)
 
 
 def live_table(rows: Sequence[dict[str, Any]]) -> Any:
-    """Return a table of trainings, with their scores over seconds and steps on axes that all share."""
+    """Return a table of trainings, with their scores over seconds and steps, on common axes."""
     from rich.table import Column, Table
 
     points = [point for row in rows for point in row["curve"]]
@@ -305,7 +303,7 @@ def told(row: dict[str, Any]) -> str:
 
 
 def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the lines of the table, and a warning where it mixes machines; nothing without trainings."""
+    """Return the lines of the table, with a warning if it mixes machines; no lines without trainings."""
     places = sorted({row.get("machine", "an unknown machine") for row in rows})
     mixed = [f"Times are from several machines: {'; '.join(places)}"] if len(places) > 1 else []
     return aligned(score_cells(rows)) + mixed if rows else []

@@ -1,8 +1,9 @@
-"""Planning in real time: how long each call of a controller takes, beside the interval between two of them.
+"""Planning in real time: how long calls of a controller take, compared with the interval between them.
 
-``python -m agents.real_time`` plays episodes by the clock with every controller that plans. Where planning
-takes longer than a step, it plans ahead in a process of its own, by `Controller.real_time`. What that costs
-is measured by the returns with and without it in other, equal episodes. `docs/agents.md` shows both.
+``python -m agents.real_time`` plays episodes by the clock with every controller that plans. If planning takes
+longer than a step, the controller plans ahead in a separate process, see `Controller.real_time`. The cost is
+the difference between the returns with and without planning ahead, in other episodes that are the same for
+both. `docs/agents.md` shows times and costs.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ def planning(env_id: str) -> Iterator[str]:
     """Yield the controllers of an environment that plan during an episode."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
-        if found.plans and not isinstance(build(task, name), ILQR):  # which plans before it
+        if found.plans and not isinstance(build(task, name), ILQR):  # this one plans before the episode
             yield name
 
 
 def clocked(env_id: str, name: str, episodes: int) -> NDArray[np.float64]:
-    """Return the seconds of each call but an episode's first, in episodes that are played by the clock."""
+    """Return the seconds that each call except an episode's first takes, in episodes played by the clock."""
     env: Any = gym.make(env_id)
     task = env.unwrapped.task
     agent = build(task, name, real_time=True)
@@ -63,7 +64,7 @@ def clocked(env_id: str, name: str, episodes: int) -> NDArray[np.float64]:
 
 
 def measured(env_id: str, name: str, clocked_episodes: int, episodes: int) -> dict[str, Any]:
-    """Return a controller's times [s], its return where it plans ahead, and what that costs."""
+    """Return a controller's times [s] and, if it plans ahead, its return and what planning ahead costs."""
     task = TASKS[env_id]()
     hurry = task.controllers[name].real_time
     seconds = clocked(env_id, name, clocked_episodes)

@@ -38,7 +38,7 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     data : dict
         What ``agents/results/summary.json`` holds.
     notes : mapping of str to str, optional
-        A text for each environment, by default its task's `note`.
+        A text for each environment; by default the `note` of its task.
     """
     notes = {id: task.note for id, task in TASKS.items()} if notes is None else notes
     envs = data["envs"]
@@ -84,7 +84,7 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
 
 
 def summary_table(data: Data) -> str:
-    """Return the table of docs/training.md: scores' range and the best agent of each kind, by environment."""
+    """Return the table of docs/training.md: each environment's scale and its best agent of each kind."""
     rows = []
     for env_id, env in data["envs"].items():
         best: dict[str, str] = {}
@@ -183,7 +183,7 @@ def _times(env: Data) -> list[str]:
 
 
 def labelled(name: str, agent: Data) -> str:
-    """Return an agent's name, for a learner with its seeds and steps.
+    """Return an agent's name; a learner's is followed by its seeds and steps.
 
     Examples
     --------
@@ -197,7 +197,7 @@ def labelled(name: str, agent: Data) -> str:
 
 
 def brief(name: str, agent: Data) -> str:
-    """Return an agent's name for figures, for a learner with its seeds and thousands of steps.
+    """Return an agent's name for figures; a learner's is followed by its seeds and thousands of steps.
 
     Examples
     --------
@@ -210,7 +210,7 @@ def brief(name: str, agent: Data) -> str:
 
 
 def stored(file: Path) -> Data:
-    """Return what a command has measured; nothing if it has not been run."""
+    """Return what a command has measured; empty if it has not been run."""
     return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
 

@@ -1,4 +1,4 @@
-"""Measure all agents on all environments, and write the results, figures and page that this project commits.
+"""Measure all agents on all environments, and write the results, the figures and the page of agents.
 
 ``python -m agents.results --help`` has the options.
 """
@@ -32,13 +32,13 @@ EPISODES, QUICK = 1000, 20
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
 
 EPILOG = f"""files read and written:
-  RUNS/ENV/ALGO/seed<K>/       policies that `python -m agents.train` left (default runs/)
+  RUNS/ENV/ALGO/seed<K>/       policies from `python -m agents.train` (default runs/)
   RUNS/measurements/ENV.jsonl  finished measurements; they are not repeated
   OUTPUT/{SUMMARY}   all numbers
   OUTPUT/{PAGE}        the page, with figures in OUTPUT/{PICTURES}
-  OUTPUT/docs/training.md     the table in it, if there is one
+  OUTPUT/docs/training.md     its table, if the page has one
 
-It can be interrupted at any time; re-run it to resume. Agents that are missing now (such as other machines'
+The command can be interrupted at any time; re-run it to resume. Agents missing now (such as other machines'
 runs) keep their numbers in the summary. Commands for different --envs may run side by side.
 
 examples:
@@ -55,18 +55,18 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--agents", nargs="+", metavar="NAME", help="agents to measure (default: all)")
     p.add_argument("--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="default runs/")
     p.add_argument(
-        "--output", type=Path, metavar="FOLDER", help="default: this checkout; with --quick, RUNS/quick"
+        "--output", type=Path, metavar="FOLDER", help="default: this clone; with --quick, RUNS/quick"
     )
     p.add_argument("--episodes", type=int, metavar="N", help=f"under each condition (default {EPISODES})")
     p.add_argument(
         "--changed",
         type=int,
         metavar="N",
-        help="at most N under changed conditions (default: 200 for agents that plan, else no limit)",
+        help="at most N episodes under changed conditions (default: 200 for agents that plan, else no limit)",
     )
     p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether everything works")
     p.add_argument("--new", action="store_true", help="discard other agents' numbers in the summary")
-    p.add_argument("--redraw", action="store_true", help="measure nothing: figures and page from the summary")
+    p.add_argument("--redraw", action="store_true", help="only remake figures and page from the summary")
     return p
 
 
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not args.new:
             load_summary(output)  # fail now, not after everything has been measured
         found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
-        # Only now: another command may have written it meanwhile.
+        # Read only now, as another command may have written the summary meanwhile.
         data = summarise_results(found, usual, {} if args.new else load_summary(output))
         write_file(output / SUMMARY, readable_json(data))
         show(data, output)
@@ -106,14 +106,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int, changed: int | None
 ) -> list[tuple[Evaluation, list[MeasurementJob]]]:
-    """Make the missing measurements; return the environments with everything to measure."""
+    """Make the missing measurements; return everything to measure, by environment."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
     evaluations = [Evaluation(env_id, runs) for env_id in envs]
     if names is not None:
         there = {entrant.name for evaluation in evaluations for entrant in evaluation.entrants}
         if unknown := sorted(set(names) - there):
-            raise UserError(f"there is no agent {unknown[0]!r} here; {hint(unknown[0], sorted(there))}")
+            raise UserError(f"there is no agent {unknown[0]!r}; {hint(unknown[0], sorted(there))}")
     found = [(evaluation, evaluation.jobs(names, episodes, changed)) for evaluation in evaluations]
     jobs = [(evaluation, job) for evaluation, own in found for job in own]
     todo = [(evaluation, job) for evaluation, job in jobs if job.key not in evaluation.returns]
@@ -128,7 +128,7 @@ def measure_all(
 def summarise_results(
     found: Sequence[tuple[Evaluation, list[MeasurementJob]]], episodes: int, old: Data
 ) -> Data:
-    """Return everything that page and figures need; agents not measured now keep their old numbers."""
+    """Return all that the page and the figures need; agents not measured now keep their old numbers."""
     envs = dict(old.get("envs", {}))
     for evaluation, jobs in found:
         envs[evaluation.env] = summarise_evaluation(evaluation, jobs, envs.get(evaluation.env))
@@ -149,14 +149,14 @@ def summarise_results(
 
 
 def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[MeasurementJob], before: Data | None) -> Data:
-    """Return the summary of an environment, with other agents' numbers from an earlier one."""
+    """Return the summary of an environment; other agents' numbers are taken from an earlier summary."""
     env_id = evaluation.env
     found = rounded_data(summarise_env(evaluation.measured(jobs), known_returns(env_id)))
     if before is not None and before["known"] == found["known"]:
         found["agents"] = best_first(before["agents"] | found["agents"])
         found["improvement"] = rounded_data(chances_of_improvement(found["agents"]))
     elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
-        print(f"{env_id}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr)
+        print(f"{env_id}: removed, as the scale of scores has changed: {', '.join(lost)}", file=sys.stderr)
     kinds = {agent["kind"] for agent in found["agents"].values()}
     there = {*found["agents"], *(["learners"] if "learned" in kinds else [])}
     names = TASKS[env_id]().observation
@@ -166,13 +166,13 @@ def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[MeasurementJob],
 
 
 def write_envs(file: Path, about: Data, envs: Data) -> None:
-    """Write results by environment, in the order of the tasks, below what they have in common."""
+    """Write the results of all environments, in the order of the tasks, after what they have in common."""
     in_order = {name: envs[name] for name in TASKS if name in envs}
     write_file(file, readable_json(about | {"envs": in_order}))
 
 
 def load_summary(output: Path, needed: bool = False) -> Data:
-    """Return the summary in an output folder; an empty one if there is none and none is needed."""
+    """Return the summary in an output folder; an empty one if there is none and it need not exist."""
     file = output / SUMMARY
     if not file.exists():
         if needed:

@@ -33,9 +33,9 @@ SCHEMA = 1
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
-#: There are so many seeds of trainings, see `first_training_seed`.
+#: Number of seeds for trainings, see `first_training_seed`.
 SEEDS = 1000
-#: What a checkpoint begins with; the digest of the rest follows.
+#: The beginning of a checkpoint; the digest of its content follows.
 DIGEST = b"sha256:"
 #: Types of the entries that are read from a result.
 NUMBER = (int, float)
@@ -46,20 +46,20 @@ KINDS: dict[str, Any] = {
 
 
 def fresh_seeds(episodes: int) -> range:
-    """Return the seeds of the first of the episodes on which agents are compared."""
+    """Return the seeds of the first episodes of those on which agents are compared."""
     return range(FIRST_FRESH_SEED, FIRST_FRESH_SEED + episodes)
 
 
 def first_training_seed(seed: int) -> int:
-    """Return the seed of a training's first environment: another training has other episodes throughout."""
+    """Return the seed of a training's first environment; no two trainings share an episode."""
     return 1_000_000 * seed % FIRST_FRESH_SEED
 
 
 def training_seeds(first: int, count: int) -> range:
-    """Return so many seeds of trainings, or raise a UserError if one would repeat another's episodes."""
+    """Return `count` seeds of trainings, or raise a UserError if one would repeat another's episodes."""
     if first + count > SEEDS:
         raise UserError(
-            f"seeds of trainings must lie below {SEEDS}, for each to have episodes of its own; got up to "
+            f"seeds of trainings must lie below {SEEDS}, so that no two share an episode; got up to  "
             f"{first + count - 1}"
         )
     return range(first, first + count)
@@ -76,7 +76,7 @@ class Run:
     env, algo, seed, steps : str, str, int, int
         Id of the environment, name of the learner, seed, steps to train for.
     hyperparameters : dict
-        As `lag_envs.hyperparams` has them.
+        Hyperparameters, in the form of `lag_envs.hyperparams`.
     """
 
     folder: Path
@@ -90,7 +90,7 @@ class Run:
     #: The digest of the files that define it, see `source_digest`.
     digest: str = ""
     trained: int = 0
-    #: Times of training alone, without compiling, tests and evaluation: wall time and processor time.
+    #: Wall time and processor time of training alone, without compiling, tests and evaluation.
     seconds: float = 0.0
     processor_seconds: float = 0.0
     #: Steps so far, seconds so far, mean return of the policy then.
@@ -143,15 +143,15 @@ class Run:
             return None
         try:
             data = file.read_bytes()
-            if data.startswith(DIGEST):  # earlier versions wrote none
+            if data.startswith(DIGEST):  # earlier versions wrote no digest
                 digest, data = data[len(DIGEST) :][:32], data[len(DIGEST) + 32 :]
                 if sha256(data).digest() != digest:
-                    raise ValueError("it is damaged, its digest is another")
+                    raise ValueError("it is damaged: its digest does not match")
             content = pickle.loads(data)
             settings, progress = content["settings"], content["progress"]
             for name in progress:
                 setattr(self, name, progress[name])
-        except Exception as error:  # whatever a damaged pickle leads to
+        except Exception as error:  # a damaged pickle can raise anything
             reason = f"{type(error).__name__}: {error}"
             raise UserError(f"{file} cannot be read ({reason}); --new starts over") from error
         self.check_settings(settings, file)
@@ -166,7 +166,7 @@ class Run:
         self.check_settings(content, file)
         if not self.path(MODEL).exists():
             raise UserError(
-                f"{file} is there, but no {MODEL}; remove it to train again, or start over with --new"
+                f"{file} exists without {MODEL}; remove it to train again, or start over with --new"
             )
         return content
 
@@ -189,12 +189,12 @@ class Run:
                 )
 
     def foreign(self) -> bool:
-        """Return whether the folder holds files that are not the run's."""
+        """Return whether the folder holds files that do not belong to the run."""
         found = self.folder.iterdir() if self.folder.exists() else ()
         return any(f.name != "tensorboard" and not f.name.endswith(".part") for f in found)
 
     def remove(self) -> None:
-        """Remove the run's files, and no others."""
+        """Remove the run's files, and no other files."""
         for name in (CHECKPOINT, MODEL, NORMALISATION, RESULT):
             self.path(name).unlink(missing_ok=True)
         for file in self.folder.glob("tensorboard/*/events.out.tfevents.*"):
@@ -207,7 +207,7 @@ def read_result(file: Path) -> dict[str, Any]:
     Raises
     ------
     UserError
-        Where it cannot be read.
+        If the file cannot be read.
     """
     try:
         content = json.loads(file.read_text())
@@ -244,7 +244,7 @@ def own_env(name: str) -> str:
     Raises
     ------
     UserError
-        If there is none, or several.
+        If there is no environment, or several.
     """
     if own_files.is_file(name):
         own_files.one(name)
@@ -253,9 +253,9 @@ def own_env(name: str) -> str:
 
 
 def source_digest(source: str, env_id: str) -> str:
-    """Return the digest of the files that define a user's task: the module that was given, and its classes'.
+    """Return the digest of the files that define a user's task: the given module, and those of its classes.
 
-    These are the classes of task and scene. What they call from other files is not noted.
+    The classes are those of task and scene. Changes in other files that they call go unnoticed.
     """
     task, modules = make_task(env_id), [source.partition(":")[0]]
     for kind, base in ((type(task), Task), (type(task.scene), Scene)):
@@ -283,9 +283,9 @@ def check_numbers(args: argparse.Namespace, **least: int) -> None:
 
 
 def check_writable(file: Path) -> None:
-    """Raise a UserError for a file that cannot be written or grow, before hours of work on its content."""
+    """Raise a UserError for a file that cannot be written or extended, before hours of work on it."""
     if file.exists() and not file.is_file():
-        raise UserError(f"{file} is not a regular file: it cannot be kept for the next time")
+        raise UserError(f"{file} is not a regular file, so nothing would be kept for the next time")
     try:
         folder = file.resolve().parent
         folder.mkdir(parents=True, exist_ok=True)
@@ -300,7 +300,7 @@ def check_writable(file: Path) -> None:
 
 
 def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Let the function of ``python -m PROGRAM`` show errors in a line and obey SIGTERM, see `run_shown`."""
+    """Make the function of ``python -m PROGRAM`` show errors in a line and obey SIGTERM, see `run_shown`."""
 
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)

@@ -2,12 +2,12 @@
 
 ``python -m agents.scale`` plays, for each environment, random actions, no control, the best known policy, the
 controllers that plan or were measured before, and the board's reference, and prints means and standard errors
-beside the numbers in use. A slow policy plays only the first episodes, and its luck is corrected by the
-reference's returns in these and in all episodes (a control variate). The reference's own number comes from
-other, independent episodes. ``--output src/lag_envs/tasks/measured.json`` stores the numbers: those in use
-stay until their entry is deleted from the file, and an environment without any gets new ones. Its best known
-policy is then the best among its controllers and learners. A learner plays with its best seed; where that run
-is missing, the policy that ships with the package is played.
+beside the numbers in use. A slow policy plays only the first episodes. Its luck in them is corrected by the
+difference between the reference's returns in these and in all episodes (a control variate). The reference's
+own number comes from other, independent episodes. ``--output src/lag_envs/tasks/measured.json`` stores the
+numbers. Numbers in use stay until their entry is deleted from the file; an environment without numbers gets
+new ones. The best known policy of such an environment is the best among its controllers and learners. A
+learner plays with its best seed; if that run is missing, the policy that ships with the package is played.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from lag_envs.tasks.measured import measured_entry as of_package
 
 Array = NDArray[np.float64]
 
-#: Seeds that nothing else uses, and those of the references' own means; episodes that are played together.
+#: Seeds that nothing else uses, seeds of the references' own means, and episodes that are played together.
 FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
 #: Episodes of slow policies: those that plan, and those that look ahead by value iteration.
 PLANNED, OPTIMAL = 1_000, 4_096
 
 
 EPILOG = """examples:
-  python -m agents.scale PivotedBar-v0 --quick     a look at one environment; nothing is written
+  python -m agents.scale PivotedBar-v0 --quick     a quick look at one environment; writes nothing
   python -m agents.scale PivotedBar-v0 --output src/lag_envs/tasks/measured.json"""
 
 
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = module_parser("agents.scale", __doc__, EPILOG)
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
-    p.add_argument("--batches", type=int, default=8, help="of episodes (default %(default)s)")
+    p.add_argument("--batches", type=int, default=8, help="batches of episodes (default %(default)s)")
     p.add_argument(
         "--size", type=int, default=BATCH, metavar="N", help="episodes of a batch (default %(default)s)"
     )
@@ -116,7 +116,7 @@ def measure_environment(
     quick : bool
         Whether to leave out slow policies.
     kept : dict, optional
-        Its entry in `lag_envs.tasks.measured`.
+        The environment's entry in `lag_envs.tasks.measured`.
     size : int
         Episodes of a batch, `BATCH` at most.
     planned : int
@@ -152,7 +152,7 @@ def measure_environment(
     def show_mean(name: str, returns: Array, used: float | None = None) -> None:
         show(name, *mean_and_error(returns), len(returns), used)
 
-    best = shipped().get(env_id)  # played where runs are missing
+    best = shipped().get(env_id)  # played if runs are missing
     in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
     for name in dict.fromkeys(names):
         if name not in {*known, *learners, "optimal"}:
@@ -195,7 +195,7 @@ def measure_environment(
 
 
 def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
-    """Return each learner's seed with the best mean return at the end of its training, by its label."""
+    """Return for each learner, by its label, the seed with the best mean return at the end of training."""
     found: dict[str, Entrant] = {}
     best: dict[str, float] = {}
     for file in sorted(runs.glob(f"{env_id}/*/seed*/{RESULT}")):

@@ -34,10 +34,10 @@ AUTHORS, LICENSE = ["the lag_envs authors"], "MIT"
 #: The public address of this file's folder.
 CODE = "https://github.com/lag-envs/lag-envs/blob/main/agents/"
 
-HELP = """submissions made, a folder each, in OUT:
+HELP = """submissions, each a folder in OUT:
   ENV-ALGO              from RUNS/ENV/ALGO/seed*/, if at least five seeds are finished
-  ENV-CONTROLLER        every one of lag_envs.controllers
-  ENV-optimal           the value functions of `python -m agents.optimum`, coarsened to a table
+  ENV-CONTROLLER        from every controller in lag_envs.controllers
+  ENV-optimal           from the value functions of `python -m agents.optimum`, coarsened to a table
 
 Existing folders are kept, so that re-running resumes; --new makes them again.
 
@@ -52,8 +52,8 @@ examples:
 def tabulate(solution: Solution) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return a solution as the table ``[policy]`` of a submission and its arrays.
 
-    The values are those after the first step and before the random kick that may follow, whose mean is taken;
-    each axis has the nodes of its own `level`.
+    The values are those after the first step and before the random kick that may follow, averaged over the
+    kick. Each axis has the nodes of its own `level`.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def tabulate(solution: Solution) -> tuple[dict[str, Any], dict[str, Array]]:
     problem, states = solution.problem, solution.task.scene.state_names
     axes, names = [], []
     for axis, name in zip(problem.axes, states, strict=True):
-        if axis.centre == "target":  # the target's mirror image may be this far away
+        if axis.centre == "target":  # the largest distance of a target from its mirror image
             axis = replace(axis, low=axis.low - max(problem.targets), centre=0.0)
             name += " - target"
         found = nodes(axis, axis.level, None)
@@ -94,7 +94,7 @@ def optimal(env_id: str, folder: Path, cache: Path | None = DEFAULT_FOLDER) -> S
     Parameters
     ----------
     env_id : str
-        One for which value iteration gives a policy.
+        Id of an environment for which value iteration gives a policy.
     folder : Path
         Destination; must not exist.
     cache : Path, optional
@@ -114,7 +114,7 @@ def optimal(env_id: str, folder: Path, cache: Path | None = DEFAULT_FOLDER) -> S
 
 
 def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
-    """Write the finished runs of a learner, in a folder for each seed, as a submission."""
+    """Write the finished runs of a learner as a submission, with a folder for each seed."""
     algo = runs.name
     name = learner_label(algo)
     origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
@@ -151,7 +151,7 @@ def entrants(env_id: str, runs: Path, cache: Path) -> Iterator[tuple[str, Callab
         if finished >= LEARNED_POLICIES:
             yield folder.name, partial(submit_learned, env_id, folder)
         elif finished:
-            print(f"{folder}: left out, it has {finished} finished runs, {LEARNED_POLICIES} are needed")
+            print(f"{folder}: left out: it has {finished} finished runs, but {LEARNED_POLICIES} are needed")
 
 
 def folder_part(name: str) -> str:

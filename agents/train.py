@@ -50,17 +50,17 @@ from lag_envs.workers import check_address, died
 
 EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
-  model.zip            the policy: give the folder to agents.learners.load_policy, or this file to the load of
+  model.zip            the policy; agents.learners.load_policy takes the folder, and the file is for `load` of
                        Stable-Baselines3, if it is one of its learners
-  tensorboard/         for `tensorboard --logdir FOLDER`, of Stable-Baselines3's learners
+  tensorboard/         for `tensorboard --logdir FOLDER`; only for Stable-Baselines3's learners
   {CHECKPOINT}       while the run is not finished: everything needed to resume; written {TESTS} times per run
 
-Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; finished seeds are left as they are.
-A run resumes from its last checkpoint: for fast_ppo, shac and cloning with the same result as without the
-interruption, for the others with different episodes.
+Re-run a command that was interrupted, by Ctrl-C or by a kill, to resume it; finished seeds stay as they are.
+A run resumes from its last checkpoint. The result of fast_ppo, shac and cloning is the same as without the
+interruption; other learners see different episodes.
 Policies of SAC, TD3, TQC and DQN get better and worse while they learn: the one that did best in a test, on
-separate episodes, is kept. For PPO it is the last one. Tests and results are of the environment with its own
-parameters; a TimeLimit among the hyperparameters shortens the episodes of training alone.
+separate episodes, is kept. PPO keeps the last policy. Tests and results are of the environment with its own
+parameters; a TimeLimit among the hyperparameters shortens only the episodes of training.
 
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
@@ -105,17 +105,15 @@ def parser() -> argparse.ArgumentParser:
 
 
 def add_run_options(p: argparse.ArgumentParser) -> None:
-    """Add the options that the command of a single learner has too."""
+    """Add the options that this command shares with the commands of single learners."""
     p.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds (default %(default)s)")
-    p.add_argument(
-        "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
-    )
+    p.add_argument("--first-seed", type=int, default=0, metavar="K", help="first seed (default %(default)s)")
     p.add_argument(
         "--steps", type=int,
         help="environment steps per seed, in place of n_timesteps; rounded up to whole updates",
     )  # fmt: skip
     p.add_argument("--output", type=new_folder, default="runs", metavar="FOLDER", help="default %(default)s")
-    p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
+    p.add_argument("--new", action="store_true", help="start over, overwriting earlier runs of these seeds")
 
 
 @reports_errors("agents.train")
@@ -143,13 +141,13 @@ def train_all(
 
 
 def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:
-    """Return the runs that are asked for, with some hyperparameters changed; or raise a UserError."""
+    """Return the requested runs, with some hyperparameters changed, or raise a UserError."""
     if "all" in args.env and len(args.env) > 1:
         raise UserError(f"all must stand alone, got {' '.join(args.env)}")
     given = list(TASKS) if args.env == ["all"] else list(dict.fromkeys(args.env))
     sources = {own_env(name): "" if name in TASKS else name for name in given}
     if args.ray and any(map(is_file, given)):
-        raise UserError("--ray takes ids and module:ID; a file is not on the other machines")
+        raise UserError("--ray takes ids and module:ID, as a file does not exist on the other machines")
     algos = [known_name("algorithm", name, LEARNERS) for name in dict.fromkeys(args.algo)]
     check_numbers(args, seeds=1, first_seed=0, steps=1, jobs=1)
     digests = {env: source and source_digest(source, env) for env, source in sources.items()}
@@ -168,7 +166,7 @@ def planned_runs(args: argparse.Namespace, changed: Mapping[str, Any] = MappingP
         for seed in training_seeds(args.first_seed, args.seeds):
             folder = args.output / env / algo / f"seed{seed}"
             runs.append(Run(folder, env, algo, seed, steps, hyper, source, digests[env]))
-    if args.ray:  # before anything is removed
+    if args.ray:  # checked before anything is removed
         check_address(args.ray)
     for run in runs:
         if args.new:
@@ -187,7 +185,7 @@ class Failure(NamedTuple):
     Attributes
     ----------
     reason : str
-        What to tell.
+        The message for the user.
     passing : bool
         Whether the same command may succeed later, as after a full disk.
     """
@@ -204,7 +202,7 @@ def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> Fa
     run : Run
         The run.
     tell : callable
-        Given ("steps", name, steps), ("tested", name, curve) and ("file", name, file, bytes).
+        Called with ("steps", name, steps), ("tested", name, curve) or ("file", name, file, bytes).
     ship : bool
         Whether to send the files too, for a run whose folder is not shared.
     """
@@ -249,12 +247,12 @@ def _begin(events: Any) -> None:
 
 
 def _here(run: Run) -> Failure | None:
-    """Work in a process of its own."""
+    """Train the run that this process was started for."""
     return train_run(run, _events.put)
 
 
 def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> Failure | None:
-    """Work on a machine that does not see the run's folder."""
+    """Train a run on a machine that does not see the run's folder."""
     with tempfile.TemporaryDirectory() as folder:
         run = Run(**settings | {"folder": Path(folder)})
         if checkpoint is not None:
@@ -323,7 +321,7 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
 
 
 def show_progress(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, Failure], bool]:
-    """Train the runs and show their progress; return the failures, and whether it was stopped."""
+    """Train the runs and show their progress; return the failures, and whether training was stopped."""
     from tqdm import tqdm
 
     failed: dict[str, Failure] = {}
@@ -375,7 +373,7 @@ def with_errors(env_id: str, returns: Sequence[float]) -> tuple[str, str]:
 
 
 def _say(bar: Any, line: str) -> None:
-    """Print a line beside the bar; in a log there is no bar."""
+    """Print a line above the progress bar; a log has no bar."""
     bar.write(line)
     sys.stdout.flush()
 
@@ -399,7 +397,7 @@ def print_returns(runs: Sequence[Run]) -> None:
 def report_failures(
     failed: Mapping[str, Failure], stopped: bool, module: str, arguments: Sequence[str] | None
 ) -> int:
-    """Print why runs failed, and how to resume where that may help; return the command's exit status."""
+    """Print why runs failed, and how to resume if that may help; return the command's exit status."""
     for name, failure in failed.items():
         print(f"{name} failed: {failure.reason}", file=sys.stderr)
     if stopped or any(failure.passing for failure in failed.values()):

@@ -1,7 +1,8 @@
 """Tune numbers of controllers and settings of our PPO, in episodes that no evaluation uses.
 
-Trainings have seeds that no reported result has. Files without a ``first_seed`` are of earlier searches, with
-training seeds from 0 on: these are reported too, so that their choice may flatter the reported scores.
+Trainings have seeds that no reported result has. Files without a ``first_seed`` are of earlier searches,
+whose training seeds start at 0. Reported results have the same seeds, so choosing settings by these searches
+may flatter the reported scores.
 
 ``python -m agents.tune --help`` has the options.
 """
@@ -44,12 +45,12 @@ from lag_envs.store import readable_json, write_file
 from lag_envs.tables import aligned
 from lag_envs.tasks import TASKS
 
-#: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
+#: Evaluation uses seeds from 1,000,000,000 on, learning curves use seeds from 2,000,000,000 on.
 FIRST_TUNING_SEED = 3_000_000_000
 #: The first seed of the trainings; reported results have lower ones.
 FIRST_TRAINING_SEED = 500
 LEARNER = "fast_ppo"
-#: Values tried for each setting. In a random draw, a setting keeps its value with probability 1/2.
+#: Values to try for each setting. In a random draw, a setting keeps its value with probability 1/2.
 CHOICES: Mapping[str, Sequence[Any]] = {
     "learning_rate": (1e-3, 2e-3, 3e-3, 5e-3, 8e-3),
     "n_envs": (64, 128, 256),
@@ -72,10 +73,10 @@ CHOICES: Mapping[str, Sequence[Any]] = {
 }
 RESULTS = ROOT / "agents" / "results" / "tuning"
 EPILOG = f"""By default the numbers of the environment's controllers are tuned by differential evolution,
-and printed; the controllers' defaults were found in this way.
+and printed. The controllers' defaults were found in this way.
 
 With --settings, settings of {LEARNER} are tried: first the task's own, then others drawn at random,
-each with some training seeds, from {FIRST_TRAINING_SEED} on: no reported result has these. FILE stores every
+each with some training seeds, from {FIRST_TRAINING_SEED} on, which no reported result has. FILE stores every
 training, so that the command can be interrupted and run again, also with more --settings or --seeds. Copy
 the best settings by hand into the task's `hyperparameters`.
 
@@ -144,12 +145,12 @@ def search_settings(
     about["changed_from"] = own
     new = about | {"machine": machine(), "first_seed": FIRST_TRAINING_SEED, "settings": []}
     data = read(file, about) or new
-    first = data.get("first_seed", 0)  # earlier searches have none
+    first = data.get("first_seed", 0)  # earlier searches did not store it
     for number in range(len(data["settings"]), count):
         changed = {name: value for name, value in drawn_changes(number).items() if own[name] != value}
         data["settings"].append({"number": number, "changed": changed, "runs": []})
     failed = 0
-    # The folder is this process's, so that it goes even if another one is killed.
+    # The folder belongs to this process, so it is removed even if another process is killed.
     with tempfile.TemporaryDirectory() as folder, workers.processes(jobs) as submit:
         futures = {}
         for setting in data["settings"][:count]:
@@ -193,7 +194,7 @@ def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def ranked_cells(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return the cells of a table, best setting first by the mean return over its seeds."""
+    """Return the cells of a table; the setting with the best mean return over its seeds comes first."""
     rows = []
     for setting in data["settings"]:
         returns = [run["return"] for run in setting["runs"]]
@@ -209,7 +210,7 @@ def ranked_cells(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def pace(data: Mapping[str, Any]) -> float:
-    """Return the steps trained per second of processor time, the median over all runs."""
+    """Return the median over all runs of the steps trained per second of processor time."""
     runs = [run for setting in data["settings"] for run in setting["runs"]]
     return float(np.median([run["trained"] / run["processor_seconds"] for run in runs]))
 
@@ -267,7 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1 if failed else 0
     if args.only not in (None, *known):
         there = hint(args.only, known, "" if known else "there is nothing to tune")
-        raise UserError(f"nothing of {args.only!r} can be tuned; {there}")
+        raise UserError(f"{args.only!r} has no numbers to tune; {there}")
     for name in known:
         if args.only in (None, name):
             numbers, mean = tune(args.env, name, args.episodes or 2000, args.generations or 15)

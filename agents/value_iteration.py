@@ -6,7 +6,7 @@ each action at each node are computed once (`transitions`); the backward recursi
 
     V_t(x) = max over a of  reward(x, a) + E V_{t+1}(kicked(next(x, a))),    V_T = 0.
 
-All V_t are stored in a file, from which a policy is read; a run that was killed resumes from it.
+All V_t are stored in a file. A policy is read from it, and a run that was killed resumes from it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Step = Callable[[Array, Array], tuple[Array, Array, NDArray[np.bool_]]]
 Kick = Callable[[Array], tuple[Array, Array]]
 
 VALUES, PROGRESS = "values.npy", "progress.json"
-#: Rows that are stepped together when the transitions are computed: bounds the memory.
+#: Rows that are stepped together when the transitions are computed; bounds the memory.
 CHUNK = 1_000_000
 #: Seconds between two records of the progress.
 RECORD = 1.0
 
 
 class CacheError(UserError):
-    """A cached value function cannot be used; the message says what to do."""
+    """Raised if a cached value function cannot be used; the message says what to do."""
 
 
 # --- the grid -----------------------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ class Grid:
     Parameters
     ----------
     axes : tuple of ndarray
-        The nodes of 2 or 3 axes, growing; their distances may differ.
+        The nodes of 2 or 3 axes, in increasing order; their spacing may vary.
     periods : tuple of float or None
         For each axis the period, or None. A periodic axis ends with its first node, one period later.
     """
@@ -115,7 +115,7 @@ class Grid:
 
 
 def stretched(low: float, centre: float, high: float, cells: int, scale: float) -> Array:
-    """Return nodes that are dense around a centre: evenly spaced within `scale`, ever wider farther out.
+    """Return nodes that are dense around a centre: evenly spaced within `scale`, and ever wider beyond it.
 
     Half of the cells lie on either side of the centre, which is a node; if the centre is an end, all cells
     lie on one side. Doubling the number of cells halves each.
@@ -164,7 +164,7 @@ def interpolate_rows(values: Any, times: Any, cells: Any, places: Any, strides: 
 
 @jit
 def regridded(x: Any, nodes: Any, own: Any, others: Any) -> Any:
-    """Carry each x from its own axis, ``nodes[own[i]]``, to the same place among the nodes `others`."""
+    """Map each x from its own axis, ``nodes[own[i]]``, to the same place among the nodes `others`."""
     out = np.empty(len(x))
     for i in range(len(x)):
         axis = nodes[own[i]]
@@ -259,7 +259,8 @@ class DynamicProgramme:
     kick : callable, optional
         The random part of a step, see `Kick`.
     parameters : dict, optional
-        Everything the step depends on, in JSON types: it names the cache, and is stored there for reference.
+        Everything the step depends on, in JSON types. It determines the cache's name and is stored in the
+        cache.
     """
 
     def __init__(
@@ -288,7 +289,7 @@ class DynamicProgramme:
 
     @property
     def name(self) -> str:
-        """Name of the cache's folder: it changes with everything that affects the result."""
+        """Name of the cache's folder, which changes with everything that affects the result."""
         text = json.dumps(self.parameters, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -390,13 +391,13 @@ class DynamicProgramme:
 class ValueCache:
     """The values in a folder: ``values.npy``, a memory-mapped array, and ``progress.json``, its progress.
 
-    The progress file is replaced as a whole, and only after its values are written: after a kill at any
-    moment the next run resumes from there, with the same result.
+    The progress file is replaced as a whole, and only after its values are written. So after a kill at any
+    moment the next run resumes from the recorded progress, with the same result.
 
     Raises
     ------
     CacheError
-        For files that are damaged or belong to something else, and a disk without room for them.
+        If the files are damaged or belong to another problem, or if the disk has no room for them.
     """
 
     def __init__(self, folder: Path, problem: DynamicProgramme, new: bool = False) -> None:
@@ -421,7 +422,7 @@ class ValueCache:
         except OSError as error:
             file.unlink(missing_ok=True)
             raise CacheError(
-                f"{file} cannot be written, it takes {size / 1e6:,.0f} MB ({error}); make room, or choose "
+                f"{file} cannot be written: it takes {size / 1e6:,.0f} MB ({error}); make room, or choose  "
                 "another --folder"
             ) from error
         self.record(self.done, 0.0)
