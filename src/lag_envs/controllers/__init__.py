@@ -63,7 +63,7 @@ KNOW_NOTHING = {
 
 
 def controllers(task: Any) -> dict[str, Controller]:
-    """Return the controllers of a task or of its class, by name."""
+    """Return the controllers of a task or a task's class, by name."""
     return KNOW_NOTHING | dict(task.controllers)
 
 
@@ -77,10 +77,10 @@ def build(task: Any, name: str, *, real_time: bool = False, **numbers: Any) -> A
     name : str
         Name of the controller.
     real_time : bool
-        Whether it has to act in time with a clock. One whose planning takes longer than a step then plans
-        some steps ahead, in a process of its own: see `ahead` of `lag_envs.controllers.mpc.MPC`.
+        Whether the controller has to keep pace with a clock. If its planning takes longer than a step, it
+        then plans some steps ahead, in a separate process: see `ahead` of `lag_envs.controllers.mpc.MPC`.
     **numbers
-        Keywords that override those of the task's record.
+        Keywords that override those in the task's record.
     """
     found = controllers(task)
     if not isinstance(name, str):
@@ -112,9 +112,9 @@ def make_controller(env_id: str, name: str, **env_options: Any) -> Any:
     Raises
     ------
     ValueError
-        For an unknown id or name; it suggests similar ones.
+        For an unknown id or name; the message suggests similar ones.
     TypeError
-        For an id or name that is not a string; `build` takes a task.
+        For an id or name that is not a string. To pass a task, use `build`.
     """
     if not isinstance(env_id, str):
         raise TypeError(

@@ -13,9 +13,9 @@ from lag_envs.tasks.base import Task
 
 
 class PublishedLQR(FeedbackController):
-    """The double pendulum project's LQR about upright: its weights, on the frictionless model.
+    """The double pendulum project's LQR about upright, with the project's weights and the frictionless model.
 
-    It acts while its cost to go is below a threshold, and turns the motor off otherwise. Friction in the
+    The regulator acts while its cost to go is below a threshold; otherwise the motor is off. Friction in the
     driven joint is compensated, as on the project's machine.
 
     Parameters

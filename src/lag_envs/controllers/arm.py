@@ -36,7 +36,7 @@ class Springs(FeedbackController):
         return self.stiffness * self.missing(state, target) - self.damping * state[..., 1::2]
 
     def missing(self, state: Array, target: Array) -> Array:
-        """Return the rotations of the joints to the posture that costs less to hold."""
+        """Return the rotations of the joints to the posture that takes less effort to hold."""
         postures = self.postures(target)
         holding = [self.holding(posture) for posture in postures]
         best = np.where((holding[0] <= holding[1])[..., None], *postures)
@@ -44,7 +44,7 @@ class Springs(FeedbackController):
         return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi))
 
     def postures(self, target: Array) -> list[Array]:
-        """Return the angles of both postures that reach a point (..., 2), or come nearest to it."""
+        """Return the angles of both postures that reach a point (..., 2), or come closest to it."""
         upper, fore = self.task.scene.length_1, self.task.scene.length_2
         x, y = target[..., 0], target[..., 1]
         cosine = (x * x + y * y - upper**2 - fore**2) / (2.0 * upper * fore)
@@ -55,7 +55,7 @@ class Springs(FeedbackController):
         ]
 
     def holding(self, posture: Array) -> Array:
-        """Return the larger of the torques that hold a posture, as shares of the largest ones."""
+        """Return the larger of the torques that hold a posture, each relative to its limit."""
         still = np.zeros((*posture.shape[:-1], 4))
         still[..., ::2] = posture
         return np.abs(self.torques(still, np.zeros(posture.shape)) / self.task.limit_control).max(axis=-1)
@@ -69,7 +69,7 @@ class Springs(FeedbackController):
 
 
 class ComputedTorque(Springs):
-    """Make each joint an independent damped spring: gravity and the links' coupling are compensated.
+    """Make each joint an independent damped spring, with gravity and the links' coupling compensated.
 
     Parameters
     ----------

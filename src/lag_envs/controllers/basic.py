@@ -1,4 +1,4 @@
-"""Shared parts of controllers, and a few that know nothing of the motion."""
+"""Shared parts of controllers, and a few controllers that do not know the equations of motion."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 class FeedbackLaw(NamedTuple):
     """A controller that is pure feedback: actions a - K (x - x₀), step by step.
 
-    The last entries hold from then on. The action is the clipped numbers, or for choices the index of the
-    largest.
+    After the last step, the last entries are used. The action is the clipped numbers or, if actions are
+    choices, the index of the largest number.
     """
 
     states: Array  #: x₀, shape (steps, n)
     actions: Array  #: a, shape (steps, numbers)
     gains: Array  #: K, shape (steps, numbers, n)
-    read: ObservationDecoder | None  #: finds x in the observation; None if x is the observation
+    read: ObservationDecoder | None  #: computes x from the observation; None if x is the observation
 
 
 class Constant:
@@ -61,7 +61,7 @@ class Constant:
 
 
 def constant(task: Task, *, action: Any) -> Constant | Choice:
-    """Return the agent that always takes one action; of listed actions, the one with this number."""
+    """Return the agent that always takes one action; among listed actions, the action with this index."""
     if not task.formulas.choices:
         return Constant(action)
     Actions(task.formulas).one(action)  # a ValueError if there is no such choice
@@ -99,7 +99,7 @@ class Feedback:
 
 
 def feedback(task: Task, **gains: float) -> Feedback:
-    """Return linear feedback for a task with one control; gains are named by the observation's entries."""
+    """Return linear feedback for a task with one control; keywords are entries of the observation."""
     check_single_control("feedback", task)
     for name in gains:
         if name not in task.observation:
@@ -108,7 +108,7 @@ def feedback(task: Task, **gains: float) -> Feedback:
 
 
 class Switch:
-    """The largest control in either direction, by the sign of a sum of observations.
+    """The largest control, in the direction given by the sign of a weighted sum of observations.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class Switch:
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
-    """Return the agent of zero control: if the control is a brake, its action is -1."""
+    """Return the agent of zero control; if the control is a brake, its action is -1."""
     task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]
     return Choice(task) if task.formulas.choices else Constant(task.rest_action)
 
@@ -148,9 +148,9 @@ class Choice:
     task : Task
         The task.
     choice : int or sequence of int, optional
-        The choice, or one for each control; by default that with the smallest control.
+        The choice, or one for each control; by default the choice of the smallest control.
     rng : Generator, optional
-        Choose at random, by these random numbers.
+        If given, choices are random, drawn from this generator.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ def at_random(task: Task, seed: int = 0) -> Random | Choice:
 
 
 class FeedbackController(ABC):
-    """Base of the controllers without memory: a control for each state.
+    """Base of the controllers without memory, whose control depends on the state alone.
 
     A subclass defines `control`. Controls beyond the task's limit are clipped.
 
@@ -212,7 +212,7 @@ class FeedbackController(ABC):
     task : Task
         The task with its parameters, ``env.unwrapped.task``.
     complete : bool
-        Whether the observation has to tell the whole state.
+        Whether the observation has to determine the whole state.
     """
 
     def __init__(self, task: Task, *, complete: bool = False) -> None:
@@ -231,21 +231,21 @@ class FeedbackController(ABC):
 
 
 def remade(task: Task, kind: type[Task] | None = None, /, **changes: Any) -> Task:
-    """Return a task with the same parameters except for the changes; perhaps of another class."""
+    """Return a task with the same parameters except for the changes, by default of the same class."""
     fields = dataclasses.fields(task.scene)
     own = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
     return (kind or type(task))(**({"dt": task.dt, "duration": task.duration} | own | changes))
 
 
 def actions_for(task: Task, controls: Array) -> NDArray:
-    """Return the actions for controls, or for the nearest possible ones.
+    """Return the actions for controls, or for the nearest possible controls.
 
     Parameters
     ----------
     task : Task
         The task.
     controls : ndarray, shape (...) or (..., n_actions)
-        The controls that actions set [SI units]; without a last axis if there is only one.
+        The controls to set [SI units]; without the last axis if there is only one control.
     """
     formulas = task.formulas
     if formulas.choices:
@@ -277,7 +277,7 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
 
 
 def check_observation(task: Task, observation: ArrayLike) -> Array:
-    """Return observations (..., n) as float64; raise a ValueError for another shape or numbers not finite."""
+    """Return observations (..., n) as float64; raise a ValueError for a wrong shape or non-finite numbers."""
     names = list(task.observation)
     try:
         values = np.asarray(observation, np.float64)
@@ -296,14 +296,14 @@ def check_observation(task: Task, observation: ArrayLike) -> Array:
 
 
 def check_counts(least: int = 1, /, **numbers: Any) -> None:
-    """Raise a ValueError for a number that is not whole, or too small."""
+    """Raise a ValueError for a number that is not whole or is too small."""
     for name, number in numbers.items():
         if not isinstance(number, (int, np.integer)) or number < least:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {number}")
 
 
 def check_names(what: str, given: Iterable[str], known: Sequence[str]) -> None:
-    """Raise a ValueError for a name that is not among the known ones."""
+    """Raise a ValueError for a name that is not among the known names."""
     for name in given:
         if name not in known:
             raise ValueError(f"{what}: there is no {name!r}; {hint(name, known)}")
@@ -317,7 +317,7 @@ def check_continuous(what: str, task: Task) -> None:
 
 
 def check_acts(what: str, task: Task) -> None:
-    """Raise a ValueError for a task without actions, and a TypeError for what is no task."""
+    """Raise a ValueError for a task without actions, and a TypeError for anything but a task."""
     check_task(what, task)
     if not task.formulas.actions:
         raise ValueError(f"{what} has nothing to do: {type(task).__name__} has no control to act with")
@@ -331,7 +331,7 @@ def check_single_control(what: str, task: Task) -> None:
 
 
 def beginning(n: int, state: Any, episode_start: ArrayLike | None) -> NDArray[np.bool_]:
-    """Return which of n episodes begin: all without a memory, else those named in the call of `predict`."""
+    """Return which of n episodes begin: all without a memory, otherwise those with a set `episode_start`."""
     fresh = np.full(n, state is None)
     return fresh if episode_start is None else fresh | np.asarray(episode_start, np.bool_).reshape(n)
 
@@ -348,23 +348,23 @@ def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:
 
 
 class ObservationDecoder:
-    """Reads states and targets from observations.
+    """A decoder, which computes states and targets from observations.
 
-    A task's observation has to be linear in the state, in cosine and sine of its angles (coordinates with the
-    unit rad), and in the target. So it is inverted from its values at zero and at the unit vectors, or
-    shorter ones if an entry is clipped.
+    A task's observation has to be linear in the state, in the cosine and sine of its angles (coordinates with
+    the unit rad), and in the target. Its values at zero and at the unit vectors, or at shorter vectors if an
+    entry is clipped, then suffice to invert it.
 
     Parameters
     ----------
     task : Task
         The task.
     complete : bool
-        Whether the observation has to tell the whole state, and the target if it is random.
+        Whether the observation has to determine the whole state, and the target if it is random.
 
     Raises
     ------
     ValueError
-        For other observations; it names the entries that cannot be read.
+        For other observations; the message names the entries that cannot be determined.
     """
 
     def __init__(self, task: Task, *, complete: bool = False) -> None:
@@ -377,7 +377,7 @@ class ObservationDecoder:
         self._width = self._n + 2 * len(angles)
 
         def seen(row: NDArray[np.float64]) -> list:
-            """Return the observation of a state, cosines and sines of its angles, and a target."""
+            """Return the observation for a state, the cosines and sines of its angles, and a target."""
             state = list(row[: self._n])
             circles = row[self._n : self._width].reshape(-1, 2)
             known = [(state[i], *circle) for i, circle in zip(angles, circles, strict=True)]
@@ -392,7 +392,7 @@ class ObservationDecoder:
                 raise ValueError(self._unreadable("observation", np.array(list(task.observation))[bad]))
         self._slopes, self._angles = slopes, angles
         self._inverse = np.linalg.pinv(slopes)
-        #: The angles that are observed only by cosine and sine, and so lie in [-π, π], and their places.
+        #: The angles that are observed only by cosine and sine, and so lie in [-π, π], with their indices.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
         self._pairs = [(i, j) for i, j in pairs if slopes[j].any() and slopes[j + 1].any()]
         self.wrapped = [i for i, _ in self._pairs]
@@ -422,14 +422,14 @@ class ObservationDecoder:
         size, axes = 1.0, np.eye(width)
         while (bad := differs(risen(size * axes), 2.0 * risen(0.5 * size * axes))).any():
             size *= 0.5
-            if size < 1e-3:  # no entry is clipped so early
+            if size < 1e-3:  # short enough that no entry is clipped
                 break
         slopes = risen(size * axes) / size
         rows = np.random.default_rng(0).uniform(-size / width, size / width, (4, width))
         return slopes, bad | differs(risen(rows), rows @ slopes)
 
     def _unreadable(self, what: str, names: Iterable[str]) -> str:
-        """Return the message for entries that cannot be read."""
+        """Return the message for entries that cannot be determined."""
         return (
             f"this controller reads the state from the observation, but not {', '.join(names)} in the {what} "
             f"of {type(self.task).__name__}: observe every entry of the state, linearly; of an angle, whose "
@@ -439,7 +439,8 @@ class ObservationDecoder:
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
         """Return states (..., n_state) and targets for observations (..., n).
 
-        Targets have the shape (...), and are 0 if there are none, or (..., n_targets) if there are several.
+        Targets have the shape (...), with zeros if the task has no target, or (..., n_targets) if it has
+        several.
         """
         lifted = (check_observation(self.task, observation) - self._zero) @ self._inverse
         state = lifted[..., : self._n].copy()
@@ -470,7 +471,7 @@ class ObservationDecoder:
         return self._zero + lifted @ self._slopes[: self._width], slopes
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return states (..., n_state) minus others; angles only seen by cos and sin the shorter way."""
+        """Return differences of states (..., n_state); angles seen only by cos and sin: the shorter way."""
         off = states - others
         for i in self.wrapped:
             off[..., i] -= 2.0 * np.pi * np.rint(off[..., i] / (2.0 * np.pi))

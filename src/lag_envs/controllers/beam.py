@@ -15,7 +15,7 @@ from lag_envs.controllers.swing_up import away
 from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
 
-#: An angle that is spread evenly over a turn has this standard deviation [rad].
+#: Standard deviation of an angle that is spread evenly over a turn [rad].
 _EVEN = math.pi / math.sqrt(3.0)
 
 
@@ -55,17 +55,18 @@ class Followed(NamedTuple):
 class BeamSearch:
     """Search for the best sequence of listed actions on the exact model, and follow it.
 
-    All states of a level are stepped with all actions. The states that follow are divided into cells, and
-    each cell keeps its best; the best `width` of these are the next level. States are ranked by their return
-    so far minus their final cost. The edges of a cell are a share of the states' standard deviations, so they
-    have no units and grow with the level's spread.
+    All states of a level are stepped with all actions. The resulting states are divided into cells, and only
+    the best state of each cell is kept; the best `width` of these form the next level. States are ranked by
+    their return so far minus their final cost. The edges of a cell are a share of the states' standard
+    deviations, so `cell` has no unit, and cells grow with the level's spread.
 
-    A search ends once a sequence that terminates pays at least what any other can. The others are credited
-    with the largest reward seen for each step that is left, or with nothing if all rewards are negative.
+    A search ends once a sequence that terminates pays at least as much as any other sequence can. The other
+    sequences are credited with the largest reward seen so far for each remaining step, or with nothing if all
+    rewards are negative.
 
-    The model agrees with an environment to rounding only. If an observed state differs from the plan, the
-    rest of the plan is tried from there. If it pays less than before, there is a new search. The chance of
-    future kicks is ignored.
+    The model agrees with an environment only to rounding. If an observed state differs from the plan, the
+    rest of the plan is tried from that state. If it then pays less than before, a new search is made. The
+    chance of future kicks is ignored.
 
     Parameters
     ----------
@@ -82,14 +83,14 @@ class BeamSearch:
     every : int, optional
         Steps after which a plan is renewed; by default it is followed to its end.
     pause : int
-        Smallest number of steps from a search to one because of a surprise.
+        Smallest number of steps between a search and one that a surprise causes.
     surprise : float
         Deviation of an entry of the state from the plan that counts as a surprise.
 
     Attributes
     ----------
     actions : ndarray of int, shape (n_choices,), or (n_choices, n_actions) where there are several
-        All actions.
+        All possible actions.
     """
 
     def __init__(
@@ -121,7 +122,7 @@ class BeamSearch:
         self.actions = each[:, 0] if task.formulas.actions == 1 else each
         self._aims = task.target_range is not None
         self._turns = np.array([unit == "rad" for unit in task.scene.state_units])
-        # Odd factors, so that the sum of a cell's numbers times these tells cells apart.
+        # Odd factors, so that the weighted sum of a cell's numbers identifies the cell.
         drawn = np.random.default_rng(0).integers(2**63, size=len(self._turns), dtype=np.uint64)
         self._factors = 2 * drawn + 1
 
@@ -163,7 +164,7 @@ class BeamSearch:
         return chosen.reshape((*values.shape[:-1], *self.actions.shape[1:])).astype(np.int64), plan
 
     def search(self, start: Array, target: Any = None) -> Trajectory:
-        """Return the best sequence of actions that is found from a state.
+        """Return the best sequence of actions found from a state.
 
         Parameters
         ----------
@@ -217,18 +218,18 @@ class BeamSearch:
         return self.model(states, self.actions[choices], goals)
 
     def _select(self, states: Array, value: Array) -> NDArray[np.intp]:
-        """Return the rows of the next level, the best first: one of each cell."""
+        """Return the rows of the next level, one from each cell, the best first."""
         spread = states.std(axis=0)
         edge = self.cell * np.where(self._turns, np.minimum(spread, _EVEN), spread)
         place = np.where(self._turns, states - 2.0 * np.pi * np.rint(states / (2.0 * np.pi)), states)
         place = (place - place.min(axis=0)) / np.where(edge > 0.0, edge, 1.0)
         key = (np.floor(place).astype(np.uint64) * self._factors).sum(axis=1, dtype=np.uint64)
-        order = np.lexsort((key, -value))  # among equals the keys' order is as good as random
+        order = np.lexsort((key, -value))  # among equal values the order of keys is as good as a random one
         _, first = np.unique(key[order], return_index=True)
         return order[np.sort(first)[: self.width]]
 
     def _along(self, state: Array, choices: NDArray[np.intp], target: Any) -> Trajectory:
-        """Return the sequence of these choices from a state, up to its end."""
+        """Return the trajectory of these choices from a state, up to its end."""
         states, rewards, ended = [], [], False
         for choice in choices:
             states.append(state)
@@ -249,7 +250,7 @@ class BeamSearch:
         return True
 
     def _keep(self, plan: Followed, row: int, found: Trajectory, step: int = 0) -> None:
-        """Store a sequence as a plan, or as its rest from a step on."""
+        """Store a sequence as a plan, or as the rest of a plan from a step on."""
         end = step + len(found.choices)
         plan.states[row, step:end], plan.choices[row, step:end] = found.states, found.choices
         plan.left[row, step:end] = np.cumsum(found.rewards[::-1])[::-1]

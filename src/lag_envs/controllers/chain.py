@@ -23,9 +23,10 @@ def easier(
 ) -> tuple[Task, Callable[[Array], Array]]:
     """Return a task that is easier to plan for, and the final cost of a plan.
 
-    Instead of the guard, which has kinks, it has a penalty that begins before the track's end. It rewards the
-    squared height, whose slope leads upward from anywhere and hardly matters beside the final cost. The
-    support is weaker, so that the feedback has a reserve with which to correct the plan.
+    In place of the guard, which has kinks, the task has a penalty that begins before the track's end. Its
+    reward is the squared height, whose slope leads upward from anywhere and which hardly matters compared
+    with the final cost. The support is weaker than in the original task, so that the feedback has a reserve
+    for correcting the plan.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ def easier(
     share : float
         Largest acceleration, as a share of the task's.
     edge : float
-        Share of the track beyond which a support that could not stop in time, braking fully, is penalised.
+        Share of the track; a support that could not stop before this share under full braking is penalised.
     """
     kind: Any = type(task)
 
@@ -64,7 +65,7 @@ def easier(
 
 
 def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:
-    """Return an iLQR that plans each episode again, starting from recorded plans.
+    """Return an iLQR that plans each episode anew, starting from recorded plans.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def anywhere(task: SwingUp, *, horizon: int = 90, good: float = 3.0, **numbers: 
     horizon : int
         Steps to plan ahead.
     good : float
-        Loss after the plan's end below which the plan counts as good.
+        A plan counts as good if the loss after its end is below this.
     **numbers
         Other arguments of `MPC`, and of `held`.
     """
@@ -113,7 +114,7 @@ def rescued(task: Balance, *, weights: Mapping[str, float], trial: int = 60, **n
     weights : mapping
         Weights of the regulator, see `BalanceLQR`.
     trial : int
-        For how many steps without kicks the regulator must keep the bars upright.
+        Number of steps without kicks for which the regulator must keep the bars upright.
     **numbers
         Other arguments of `MPC`.
     """

@@ -14,7 +14,7 @@ from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
 
 
 class ShellPD(PD):
-    """Hold a cylinder at an angle by the shell's rate; see `PD`, with the numbers that `tune` found."""
+    """Hold a cylinder at an angle by the shell's rate; see `PD`. Defaults are from `agents.tune`."""
 
     task: Tilt
 
@@ -70,8 +70,8 @@ class EnergyPump(FeedbackController):
     """Pump the swing to the wanted energy, and compensate for the drag.
 
     Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes at the rate θ' (push u - drag (θ' - ψ')),
-    so one control keeps it constant, and an addition in the direction of θ' raises it. The shell is drawn
-    back to rest.
+    so one value of the control keeps the energy constant, and an addition in the direction of θ' raises it.
+    The shell is drawn back to rest.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class EnergyPump(FeedbackController):
 def plan_pumping(task: Pump, *, opening: float = 0.25) -> ILQR:
     """Return an iLQR that plans the pumping from both directions.
 
-    It starts from a softer pump, which leads to better plans.
+    Planning starts from a softer pump, which leads to better plans.
 
     Parameters
     ----------
@@ -126,15 +126,15 @@ class BrakingLine(FeedbackController):
     """Brake hard away from the bottom, roll freely towards it, and brake along a line into it.
 
     Under full brake the cylinder is overdamped: near the bottom it creeps along the slow direction of its
-    linearised motion, or rushes along the fast one, θ' = -s θ. So it rolls freely until it is nearly that
-    fast, and is then braked onto the line and kept on it.
+    linearised motion, or rushes along the fast one, θ' = -s θ. So the cylinder rolls freely until it is
+    nearly that fast, and is then braked onto this line and kept there.
 
     Parameters
     ----------
     task : Damping
         The task, ``env.unwrapped.task``.
     steepness : float
-        Slope of the line over that of the fast direction.
+        Slope of the line, divided by that of the fast direction.
     sharpness : float
         Change of the brake, relative to the largest, per relative deviation of the speed from the line's.
     """

@@ -17,7 +17,7 @@ from lag_envs.tasks.base import Task
 def in_charge(
     cost: Array, before: ArrayLike | None, episode_start: ArrayLike | None, catch: float, lose: float
 ) -> NDArray[np.bool_]:
-    """Return where a regulator acts: its cost to go is below `catch`, or below `lose` if it acted before."""
+    """Return where a regulator acts: at a cost to go below `catch`, or below `lose` if it acted before."""
     acted = np.zeros(cost.shape, np.bool_) if before is None else np.array(before, np.bool_)
     if episode_start is not None:
         acted &= ~np.asarray(episode_start, np.bool_).reshape(acted.shape)
@@ -56,7 +56,7 @@ class Pumped(Regulator):
         return actions_for(self.task, np.where(holds, self.control(x, target), self.swing(x))), holds
 
     def law(self, task: Task) -> None:
-        """Return None: this is not pure feedback."""
+        """Return None, as this controller is not pure feedback."""
         return
 
 
@@ -64,17 +64,18 @@ class PivotEnergyLQR(Pumped):
     """Swing a pendulum up by accelerating its pivot, then hold it.
 
     The pivot is accelerated in the direction that does work on the pendulum, in proportion to the missing
-    energy [1]_, and softly back to its middle. The energy is that of the pendulum alone, with the pivot at
-    rest. The force for the wanted acceleration follows from the equations of motion, which are linear in it.
+    energy [1]_, and is softly drawn back to its middle. The energy is that of the pendulum alone, with the
+    pivot at rest. The force for the wanted acceleration follows from the equations of motion, which are
+    linear in the acceleration.
 
     Parameters
     ----------
     task : Task
-        A task whose one control acts on the pivot.
+        A task whose only control acts on the pivot.
     pivot, angle : str
         Coordinates of pivot and pendulum.
     pump : float
-        The pivot's acceleration per missing energy, relative to the energy between both rests.
+        The pivot's acceleration per missing energy, relative to the energy difference between the two rests.
     centring : float
         Stiffness with which the pivot is drawn to its middle [1/s²].
     **regulator

@@ -24,7 +24,7 @@ from lag_envs.tasks.base import Task
 
 
 class Belief(NamedTuple):
-    """The belief about each episode: its state before the last action, the uncertainty, and that action."""
+    """The belief about each episode: the state before the last action, its uncertainty, and the action."""
 
     state: Array  # (n, n_state)
     covariance: Array  # (n, n_state, n_state)
@@ -35,9 +35,9 @@ class Belief(NamedTuple):
 class Filtered:
     """Act on a state estimate from an extended Kalman filter on the exact model [1]_.
 
-    Between observations the estimate follows the model, and its covariance the model's exact derivatives; the
-    dependence of a guard's effect on the state is neglected. The first estimate is the centre of the task's
-    start distribution, with its spread as uncertainty.
+    Between observations the estimate follows the model, and its covariance follows the model's exact
+    derivatives. How a guard's effect depends on the state is neglected. The first estimate is the centre of
+    the task's start distribution, with its spread as uncertainty.
 
     Parameters
     ----------
@@ -47,21 +47,21 @@ class Filtered:
     controller : controller
         Acts on observations computed from the estimate.
     drift : float
-        Standard deviation that is added to the estimate in each step, as a share of the state's spread at the
-        start: an overconfident filter would ignore observations. It stands for all that disturbs the motion,
-        such as kicks, pushes and action noise.
+        Standard deviation added to the estimate's in each step, as a share of the state's spread at the
+        start. It stands for everything that disturbs the motion, such as kicks, pushes and action noise.
+        Without it, an overconfident filter would ignore observations.
 
     Raises
     ------
     ValueError
-        For other tasks, and for a motion that is disturbed although `drift` is 0.
+        For other tasks, and if the motion is disturbed although `drift` is 0.
 
     References
     ----------
     .. [1] R. F. Stengel, "Optimal control and estimation", Dover 1994, section 4.7.
     """
 
-    #: Its belief is about steps of one length.
+    #: The belief holds for steps of one length.
     of_one_interval = True
 
     def __init__(self, task: Task, controller: Any, *, drift: float = 0.0) -> None:
@@ -132,14 +132,15 @@ class Filtered:
 
 
 def follow_filtered(task: Task, *, effort: float, drift: float) -> Filtered:
-    """Return a controller that follows a task's recorded plan by the estimate.
+    """Return a controller that follows a task's recorded plan, acting on the estimate.
 
     Parameters
     ----------
     task : Task
         The task, ``env.unwrapped.task``.
     effort : float
-        Weight of the squared deviation of an action: with noisy observations, plans are followed gently.
+        Weight of the squared deviation of an action; with noisy observations, plans should be followed
+        gently.
     drift : float
         As in `Filtered`.
     """
@@ -148,7 +149,7 @@ def follow_filtered(task: Task, *, effort: float, drift: float) -> Filtered:
 
 
 def renewed_filtered(task: Task, *, drift: float, **numbers: Any) -> Filtered:
-    """Return a controller that renews a task's recorded plan by the estimate.
+    """Return a controller that renews a task's recorded plan from the estimate.
 
     Parameters
     ----------

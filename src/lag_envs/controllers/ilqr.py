@@ -17,9 +17,9 @@ from lag_envs.tasks.base import Task
 
 #: Step sizes of the line search, tried in parallel.
 SHARES = 0.5 ** np.arange(0, 10, 1.5)
-#: Most sweeps in which the best actions within their bounds are found.
+#: Largest number of sweeps in the search for the best actions within their bounds.
 SWEEPS = 20
-#: Smallest trusted curvature over an action [reward/action²], in a step of the task's own interval.
+#: Smallest trusted curvature with respect to an action [reward/action²], in a step of the task's interval.
 FLAT = 1e-4
 #: States (..., n_state), targets and the step of a roll-out to actions (..., n_actions).
 Feedback = Callable[[Array, Array, int], Array]
@@ -38,16 +38,17 @@ class Plan(NamedTuple):
 class ILQR:
     """Plan each episode at its start with the exact model, and follow the plan by time-varying feedback.
 
-    It starts from the actions of another controller. Each iteration expands the model along the trajectory,
-    dynamics to first order and reward to second, and solves the linear-quadratic problem within the bounds of
-    the action [1]_; the best of several step sizes is kept. So a plan is never worse than its initial guess.
+    Planning starts from the actions of another controller. Each iteration expands the model along the
+    trajectory, the dynamics to first order and the reward to second, and solves the linear-quadratic problem
+    within the bounds of the action [1]_. The best of several step sizes is kept. So a plan is never worse
+    than its initial guess.
 
     Parameters
     ----------
     task : Task
         The task with its parameters, ``env.unwrapped.task``; with continuous actions, without random kicks.
     guesses : sequence of controllers
-        Initial guesses; each is improved, and the best plan is played. `improve` alone needs none.
+        Initial guesses; each is improved, and the best plan is played. Only the method `improve` needs none.
     after : controller, optional
         Takes over if the plan ends before the episode; by default the first guess.
     tail : callable, optional
@@ -57,11 +58,11 @@ class ILQR:
     iterations : int
         Largest number of iterations.
     tolerance : float
-        The iteration ends if the return improves by less.
+        The iteration ends if the return improves by less than this.
     gains : callable, optional
         Takes states (n, steps, n_state) and actions of finished plans, returns their feedback (n, steps,
-        n_actions, n_state). By default it is that of the last iteration, optimal near an optimal plan. But
-        an action whose Newton step leads beyond its bounds has none.
+        n_actions, n_state). By default it is the feedback of the last iteration, which is optimal near an
+        optimal plan; but an action whose Newton step leads beyond its bounds gets no feedback.
 
     References
     ----------
@@ -200,7 +201,7 @@ class ILQR:
             slopes = self._expand(plan.states[going], plan.actions[going], targets[going])
             with np.errstate(over="ignore", invalid="ignore"):
                 change, gains = self._solve(plan.actions[going], damping[going], *slopes)
-            # Where the value overflows, nothing changes, and the next iteration has more damping.
+            # If the value overflows, nothing is changed, and the next iteration has more damping.
             lost = ~(np.isfinite(change) & np.isfinite(gains).all(axis=3)).all(axis=(1, 2))
             change[lost], gains[lost] = 0.0, 0.0
             plan.gains[going] = gains
@@ -214,7 +215,7 @@ class ILQR:
             won = going[better]
             plan.states[won], plan.actions[won], returns[won] = states[better], actions[better], tried[better]
             damping[going] = np.clip(damping[going] * np.where(better, 0.3, 10.0), 1e-6, 1e3)
-            # An episode is done when it hardly gains, or when even the smallest step sizes gain nothing.
+            # An episode is done when its gain is small, or when even the smallest step sizes gain nothing.
             done = np.where(better, gain < self.tolerance, damping[going] >= 1e3)
             going = going[~done]
             if not len(going):
@@ -273,7 +274,7 @@ class ILQR:
             slopes[part] = found.slopes.transpose(0, 2, 1).reshape(slopes[part].shape)
             gradient[part] = found.gradient.reshape(gradient[part].shape)
             curvature[part] = found.curvature.reshape(curvature[part].shape)
-        # At a bound the reward is as steep as just inside, except for the curvature.
+        # At a bound the reward has the same slope as just inside, except for the curvature.
         bend = curvature[..., width:, width:]
         gradient[..., width:] += np.einsum("...ab,...b->...a", bend, actions - inner)
         curvature = concave(curvature)
@@ -316,15 +317,15 @@ class ILQR:
             cross = np.einsum("nai,naj->nij", gain, h_ux)
             outer = np.einsum("nai,nbj,nab->nij", gain, gain, h_uu)
             value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
-            # Asymmetry from rounding grows along unstable plans. With one action it stays: removing it would
-            # change stored results.
+            # Asymmetry from rounding grows along unstable plans. With a single action it is not removed,
+            # because that would change stored results.
             if self.count > 1:
                 value_xx = 0.5 * (value_xx + value_xx.transpose(0, 2, 1))
         return change, gains
 
 
 class Opening:
-    """One action for a while, then another controller: a guess with a different beginning.
+    """A guess with a different beginning: one action for a while, then another controller.
 
     Parameters
     ----------
@@ -342,7 +343,7 @@ class Opening:
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
-        """Return the action for each observation; the state holds the step and the other's memory."""
+        """Return the action for each observation; the state holds the step and the memory of `then`."""
         shape = np.shape(observation)[:-1]
         step, memory = (np.zeros(shape, np.intp), None) if state is None else state
         if episode_start is not None:
@@ -359,7 +360,7 @@ def concave(matrices: Array) -> Array:
 
 
 def convex(matrices: Array, least: float) -> Array:
-    """Return symmetric matrices (..., m, m) with eigenvalues of at least a number, and never singular."""
+    """Return symmetric matrices (..., m, m), never singular, with eigenvalues of at least a given number."""
     if matrices.shape[-1] == 1:
         return np.maximum(matrices, least)
     values, vectors = np.linalg.eigh(matrices)
@@ -371,8 +372,8 @@ def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: flo
     """Return the best step d of actions within their bounds, and its feedback on the state.
 
     The step maximises slope'd - d'bend d/2 by projected Newton. In each sweep, one action after the other
-    takes its best value, which tells those at a bound; a Newton step of the rest, up to the next bound,
-    follows. Actions at a bound get no feedback.
+    takes its best value, which shows which actions are at a bound; then the others take a Newton step, up to
+    the next bound. Actions at a bound get no feedback.
 
     Parameters
     ----------
@@ -419,6 +420,6 @@ def within(actions: Array, slope: Array, bend: Array, mixed: Array, largest: flo
 
 
 def inside(actions: Array, bend: Array, largest: float) -> tuple[NDArray[np.bool_], Array]:
-    """Return which actions are within their bounds, and the curvature, replaced by 1 for the others."""
+    """Return which actions are within their bounds, and the curvature, with 1 in its place for the others."""
     free = np.abs(actions) < largest
     return free, np.where(free[:, :, None] & free[:, None], bend, np.eye(actions.shape[1]))

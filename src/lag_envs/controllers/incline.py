@@ -17,7 +17,7 @@ POINTS = 20_000
 
 
 class TiltPD(PD):
-    """Hold a cylinder at a mark by the tilt of its plane; see `PD`, with the numbers that `tune` found."""
+    """Hold a cylinder at a mark by the tilt of its plane; see `PD`. Defaults are from `agents.tune`."""
 
     task: Tilt
 
@@ -43,10 +43,10 @@ class TiltPD(PD):
 class TiltCascade(FeedbackController):
     """Hold a cylinder at a mark: a linear-quadratic regulator, written as a cascade.
 
-    The regulator's u = -K (x - x*, w, φ) is the same as a control of the tilt, u = K_φ (φ_wanted - φ), behind
-    one of the place, φ_wanted = -(K_x (x - x*) + K_w w)/K_φ. In this form, the wanted tilt can be limited to
-    the plane's range. Far from the mark, the place loop asks for no more speed than can be braked: there the
-    error enters by its square root.
+    The regulator's u = -K (x - x*, w, φ) is the same as two loops in series: control of the place, φ_wanted =
+    -(K_x (x - x*) + K_w w)/K_φ, then control of the tilt, u = K_φ (φ_wanted - φ). In this form, the wanted
+    tilt can be limited to the plane's range. Far from the mark, the place loop asks for no more speed than
+    can be braked, because the error enters by its square root.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class TiltCascade(FeedbackController):
         """Return the tilt's rate, or the tilt."""
         gain = np.append(self.gain, 1.0) if self.task.quasi_static else self.gain
         off, w = state[..., 0] - target, state[..., 1]
-        # The wanted speed is proportional near the mark, and a square root where it could not be braked.
+        # The wanted speed is proportional to the error near the mark, and to its square root farther away.
         slope = gain[0] / gain[1]
         near = self.acceleration / slope**2
         size = np.abs(off)
@@ -88,8 +88,9 @@ class TiltCascade(FeedbackController):
 class SwitchingLine(FeedbackController):
     """Let a cylinder roll freely, then brake fully, along the curve that ends at the line at a wanted speed.
 
-    The curve is one run of the scene under full brake: the equation of motion does not depend on the place.
-    In the step that reaches the curve, the brake is chosen such that the step ends on it.
+    The curve is one run of the scene under full brake; one suffices, as the equation of motion does not
+    depend on the place. In the step that reaches the curve, the brake is chosen such that the step ends on
+    it.
 
     Parameters
     ----------
@@ -105,18 +106,18 @@ class SwitchingLine(FeedbackController):
         super().__init__(task)
         self.speed = task.gentle if speed is None else speed
         self.model = Model(task)
-        # No brake gets below the terminal speed of a full one.
+        # No brake gets below the terminal speed under full brake.
         pull, rate = task.coefficients([0.0, 0.0], [task.limit_control], np)
         settled = pull / rate
         self.speed, fastest = max(self.speed, 1.02 * settled), max(fastest, 3.0 * settled)
         # In ten times 1/rate the excess of speed falls to 5e-5 of its initial value.
         run = task.scene.simulate([0.0, fastest], [task.limit_control] * POINTS, 10.0 / rate / POINTS)
         run = run[: np.searchsorted(-run[:, 1], -self.speed)]
-        #: Increasing speeds, and the distance needed to brake down from them.
+        #: Increasing speeds, and the distances needed to brake from them to the wanted speed.
         self.curve = run[::-1, 1], run[-1, 0] - run[::-1, 0]
 
     def margin(self, x: Array, v: Array) -> Array:
-        """Return the distance left after braking fully from now on; below 0 the line is crossed too fast."""
+        """Return the distance left after full braking from now on; below 0, the line is crossed too fast."""
         return -x - np.interp(v, *self.curve, left=0.0)
 
     def control(self, state: Array, target: Array) -> Array:
@@ -134,7 +135,7 @@ class SwitchingLine(FeedbackController):
 
 
 def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
-    """Return the largest return of the braking task, which no policy exceeds, however often it acts.
+    """Return the largest return of the braking task; no policy exceeds it, however often it acts.
 
     Of all motions that cross the line at a given speed, rolling freely and then braking fully is the fastest
     at every place: before the switch nothing is faster, and after it nothing faster can still slow down to
@@ -176,17 +177,17 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
 
     def crossing(place: Array, speed: Array, force: FixedSlope) -> tuple[Array, Array]:
-        """Return time and speed of passing 0: the integral of x'' = pull - drag x' over the way."""
+        """Return the time and speed at which 0 is passed, by integrating x'' = pull - drag x'."""
         time = crossing_time(place, speed, force, np.inf, np)
         return time, speed + force.acceleration * time + force.damping_rate * place
 
     early, late = x, np.zeros_like(x)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # in branches that are not taken
-        for _ in range(50):  # until the two differ by a rounding
+        for _ in range(50):  # until both differ only by rounding
             switch = 0.5 * (early + late)
             _, fast = crossing(x - switch, v, free)
             time, slow = crossing(switch, fast, full)
-            # Seconds saved per m/s more at the line, for a later start of the brake.
+            # Seconds saved per additional m/s at the line, if braking starts later.
             saved = (slow / fast * np.exp(full.damping_rate * time) - 1.0) / full.acceleration
             later = (slow <= task.gentle) | (saved > task.price)
             early, late = np.where(later, switch, early), np.where(later, late, switch)

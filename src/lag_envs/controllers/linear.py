@@ -74,14 +74,14 @@ def regulator(
 ) -> tuple[Array, Array]:
     """Return K of δu = -K δx, shape (n,), and P of the cost δx'Pδx from here on, near an equilibrium.
 
-    That cost includes the present state's own, which the task's reward has paid already.
+    That cost includes the cost of the present state, which the task's reward has paid already.
 
     Parameters
     ----------
     task : Task
         The task; the regulator optimises its reward to second order.
     state : sequence of float, shape (n,)
-        The equilibrium without control, and with the target 0.
+        The equilibrium without control and with target 0.
     extra : mapping of str to float, optional
         Additional costs of a step of the task's own interval: weights of the squares of states, by name, and
         of "u".
@@ -112,7 +112,7 @@ def _cost(a: Array, b: Array, q: Array, r: Array) -> Array:
 
 
 def _gain(a: Array, b: Array, p: Array, r: Array) -> Array:
-    """Return K of the best u = -K x, if x'Px is the cost after the step Ax + Bu and u'Ru that of u."""
+    """Return K of the best u = -K x, if x'Px is the cost after the step Ax + Bu and u'Ru the cost of u."""
     return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), np.float64)
 
 
@@ -124,9 +124,9 @@ def time_varying(
     weights: Mapping[str, float],
     effort: float,
 ) -> tuple[Array, Array]:
-    """Return the feedback that keeps a task on a plan, and the one that holds it at rest.
+    """Return the feedback that keeps a task on a plan, and the feedback that holds it at rest.
 
-    Both minimise the weighted sum of squared deviations from the plan, the first one backwards from its end,
+    Both minimise the weighted sum of squared deviations. The first is computed backwards from the plan's end,
     where the second takes over.
 
     Parameters
@@ -138,7 +138,7 @@ def time_varying(
     actions : ndarray, shape (steps,), or (steps, n_actions) where there are several
         Its actions.
     rest : sequence of float, shape (n_state,)
-        The equilibrium at its end.
+        The equilibrium at the plan's end.
     weights : mapping of str to float
         Weights of squares of deviations, by entry of the state.
     effort : float
@@ -149,7 +149,7 @@ def time_varying(
     gains : ndarray, shape (steps, n_state) or (steps, n_actions, n_state)
         K_t of δa = -K_t δx.
     hold : ndarray, shape (n_state,) or (n_actions, n_state)
-        The same at rest.
+        The feedback K at rest.
     """
     check_continuous("time_varying", task)
     scene, m = task.scene, task.formulas.actions
@@ -174,16 +174,16 @@ def time_varying(
 class Regulator(FeedbackController):
     """Hold a rest by a linear-quadratic regulator of the exact control step.
 
-    It holds the same rest whatever the task's target is.
+    The rest does not depend on the task's target.
 
     Parameters
     ----------
     task : Task
-        The task, ``env.unwrapped.task``; no control at all must be among its actions.
+        The task, ``env.unwrapped.task``; its actions must include zero control.
     at : mapping, optional
         Nonzero entries of the state at rest.
     weights : mapping
-        Cost of the square of each state entry in a step.
+        Cost of the square of each state entry, per step.
     effort : float
         Cost of the squared control, as a share of the largest control.
     """
@@ -248,7 +248,7 @@ class Regulator(FeedbackController):
         return u[..., 0] if self.gain.shape[0] == 1 else u
 
     def law(self, task: Task) -> FeedbackLaw | None:
-        """Return the controller as feedback; None where it is not: with several lists of actions."""
+        """Return the controller as feedback; None if there are several lists of actions."""
         if task.formulas.choices and task.formulas.actions > 1:
             return None
         return hold_law(task, self.rest, self.gain, self.read)
@@ -257,13 +257,13 @@ class Regulator(FeedbackController):
 class BalanceLQR(FeedbackController):
     """Keep bodies on a moving support upright by a linear-quadratic regulator, despite kicks.
 
-    The reward alone would make the regulator react as hard as possible; the added weights keep it ready
-    for the next kick. ``python -m agents.tune`` found them.
+    The reward alone would make the regulator react as hard as possible; the added weights, found by ``python
+    -m agents.tune``, keep it ready for the next kick.
 
     Parameters
     ----------
     task : Task
-        The task, ``env.unwrapped.task``; its examples tell the upright rest.
+        The task, ``env.unwrapped.task``; the upright rest is taken from its examples.
     effort : float
         Weight of (u/U)².
     slide, turn : float

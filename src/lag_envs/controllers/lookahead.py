@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Clocked(ABC):
-    """Base of the agents that act by state, target and time; a subclass defines `act`.
+    """Base of the agents whose action depends on state, target and time; a subclass defines `act`.
 
     Their memory is the number of steps taken in each episode.
 
@@ -33,7 +33,7 @@ class Clocked(ABC):
         self.read = ObservationDecoder(task, complete=complete)
         self._chooses = bool(task.formulas.choices)
         self.largest = task.formulas.largest
-        #: Advance of the clock at each `predict`: less than 1 when acting more often.
+        #: By how much each `predict` advances the clock; less than 1 if the agent acts more often.
         self.pace = 1.0
 
     @abstractmethod
@@ -57,7 +57,7 @@ class Clocked(ABC):
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray, Array]:
-        """Return the action for each observation, and the steps taken by then."""
+        """Return the action for each observation, and the number of steps taken by then."""
         values = np.asarray(observation, np.float64)
         batch = np.atleast_2d(values)
         taken = np.broadcast_to(np.asarray(0.0 if state is None else state, np.float64), len(batch))
@@ -71,7 +71,7 @@ class Clocked(ABC):
 class LookAhead(Clocked):
     """Takes the action with the largest reward + value after one step of the exact, undisturbed model.
 
-    It tries a set of actions, and then finer ones around the best, unless the actions are listed.
+    The agent tries a set of actions and, unless the actions are listed, finer ones around the best.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class LookAhead(Clocked):
         Takes the ends of steps (n, n_state), targets (n,) and the steps taken before them (n,); returns the
         mean return still to come (n,).
     actions : ndarray
-        The number of evenly spaced actions to try first; listed actions are all tried.
+        The number of evenly spaced actions to try first; if actions are listed, all are tried.
     """
 
     def __init__(self, task: Task, value: Callable[[Array, Array, Array], Array], actions: Array) -> None:

@@ -1,4 +1,4 @@
-"""Model-predictive control: plan on the exact model, and again whenever the outcome differs."""
+"""Model-predictive control: plan on the exact model, and plan again whenever the outcome differs."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ Tail = Callable[[Array], Array]
 
 
 class Coming(NamedTuple):
-    """Plans in the making."""
+    """Plans that are being made."""
 
-    left: int  # calls of `predict` until they are followed
+    left: int  # calls of `predict` until the plans are followed
     rows: NDArray[np.intp]  # their episodes
-    wanted: NDArray[np.bool_]  # which of these have not ended in the meantime
+    wanted: NDArray[np.bool_]  # which of the episodes have not ended in the meantime
     made: Future  # an `Ahead` of these rows
 
 
@@ -52,10 +52,10 @@ class Ahead(NamedTuple):
 class MPC:
     """Plan ahead on the exact model, follow the plan, and plan again every few steps or after a surprise.
 
-    A new plan begins with the rest of the old one, followed with its feedback and improved by a few
-    iterations of iLQR. An episode's first plan begins with the best of recorded ones, improved as much.
-    Without any, or if a plan ends badly, as it may after hard kicks, plans are searched for from random
-    guesses. The chance of future kicks is ignored.
+    A new plan starts from the rest of the old one, followed with its feedback and improved by a few
+    iterations of iLQR. An episode's first plan starts from the best of the recorded plans, improved in the
+    same way. If there are no recorded plans, or if a plan ends badly, as it may after hard kicks, a plan is
+    searched for from random guesses. The chance of future kicks is ignored.
 
     Parameters
     ----------
@@ -66,16 +66,16 @@ class MPC:
     horizon : int
         Steps to plan ahead, but at most those of an episode.
     first : sequence of Tracking
-        Recorded plans of the task, from which each episode's first plan is made. With these, nothing is
-        searched for at the start, and all plans are followed by the feedback that `Task.plans` specifies.
+        Recorded plans of the task, from which each episode's first plan is made. If they are given, there is
+        no search at the start, and all plans are followed with the feedback that `Task.plans` specifies.
     every : int
         Steps after which a plan is renewed.
     ahead : int
-        Steps that a renewal may take, searches included. It begins with the state predicted for its end, and
-        the old plan is followed until then. An episode's first plan is made before the episode goes on.
+        Steps that a renewal may take, including searches. The new plan starts from the state predicted for
+        the end of these steps, and the old plan is followed until then. The episode waits for its first plan.
     background : bool
-        Whether a process of its own makes the plans, so that `predict` returns at once, as real time demands,
-        and waits only for a plan that is not ready in `ahead` steps. The actions are the same.
+        Whether a separate process makes the plans. Then `predict` returns at once, as real time demands, and
+        waits only for a plan that is not ready after `ahead` steps. The actions are the same.
     iterations : int
         Iterations of iLQR for a renewal.
     budget : int
@@ -83,7 +83,8 @@ class MPC:
     guesses : int
         Number of guesses that a search improves.
     good : float
-        Final cost below which a plan counts as good. By default all do, and there is no search but the first.
+        Final cost below which a plan counts as good. By default every plan does, and only the first plan is
+        searched for.
     pause : int
         Smallest number of steps between searches.
     surprise : float
@@ -100,10 +101,10 @@ class MPC:
     hold : Tracking, optional
         Feedback that continues a plan beyond its end, and that acts where `holds`.
     holds : callable, optional
-        Tells where no plan is needed, from states (n, n_state) to booleans (n,).
+        Takes states (n, n_state) and returns booleans (n,): where no plan is needed.
     seed : int
-        Seed of the guesses. All episodes share them, so a plan may depend on the plans before; a new agent
-        begins again.
+        Seed of the guesses. All episodes share the random numbers, so a plan may depend on the plans made
+        before; a new agent starts over.
     """
 
     def __init__(
@@ -216,13 +217,13 @@ class MPC:
         return vars(self) | {"_elsewhere": None}
 
     def _clipped(self, action: Array) -> NDArray[np.float32]:
-        """Return actions as the environment gets them."""
+        """Return actions in the form that the environment takes."""
         return np.clip(action, -self.largest, self.largest).astype(np.float32)
 
     def _arrive(
         self, plan: Ahead, made: Sequence[Coming], fresh: NDArray[np.bool_]
     ) -> tuple[list[Coming], NDArray[np.bool_]]:
-        """Store plans whose time has come; return the others, and which episodes wait for one."""
+        """Store plans whose time has come; return the others, and which episodes wait for a plan."""
         coming, busy = [], np.zeros(len(fresh), np.bool_)
         for one in made:
             wanted = one.wanted & ~fresh[one.rows]
@@ -241,7 +242,7 @@ class MPC:
         plan.step[rows], plan.wait[rows] = 0, np.maximum(plan.wait[rows], found.wait)
 
     def _made(self, *arguments: Any) -> Future:
-        """Return the result of `_make`, which another process may still work on."""
+        """Return the result of `_make`, which another process may still be computing."""
         if self._elsewhere:
             return self._elsewhere.call("_make", *arguments)
         made: Future = Future()
@@ -282,14 +283,14 @@ class MPC:
         return old._replace(step=old.step + self.ahead * self.finer), x
 
     def _followed(self, plan: Ahead, rows: Any, step: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
-        """Return how far states (n, n_state) are off plans at some of their steps, and the actions."""
+        """Return how far states (n, n_state) are from plans at given steps, and the actions."""
         now, part = np.divmod(np.minimum(step, self.over - self.finer), self.finer)
         planned, after = (plan.states[rows, i] for i in (now, np.minimum(now + 1, self.horizon - 1)))
         off = self.read.difference(x, planned + (part / self.finer)[:, None] * (after - planned))
         return off, plan.actions[rows, now] + np.einsum("iaj,ij->ia", plan.gains[rows, now], off)
 
     def _following(self, plan: Ahead) -> Feedback:
-        """Return the feedback that follows plans to their ends, and holds there."""
+        """Return the feedback that follows plans to their ends, and holds the state there."""
         rows = np.arange(len(plan.step))
 
         def act(x: Array, targets: Array, t: int) -> Array:
@@ -311,7 +312,7 @@ class MPC:
         return np.reshape(law.act(x, targets, np.full(len(x), taken)), (len(x), self.count))
 
     def _begin(self, x: Array, targets: Array) -> Plan:
-        """Return the best of the plans from recorded ones."""
+        """Return the best of the plans made from recorded plans."""
         m, pace = len(self.first), self.task.dt / self.task.interval
 
         def act(x: Array, targets: Array, t: int) -> Array:
@@ -323,7 +324,7 @@ class MPC:
         return self._best(self.planner, x, targets, m, act)
 
     def _gains(self, states: Array, actions: Array) -> Array:
-        """Return the feedback (n, horizon, n_actions, n_state) along plans: that along recorded ones."""
+        """Return the feedback (n, horizon, n_actions, n_state) along plans, made as for recorded plans."""
         n, width = len(states), states.shape[-1]
         plans, gains = self.plans, np.empty((n, self.horizon, self.count, width))
         for i in range(n):
@@ -354,7 +355,7 @@ class MPC:
 
 
 def _part(plan: Ahead, rows: NDArray) -> Ahead:
-    """Return copies of the plans of some episodes, without those in the making."""
+    """Return copies of the plans of some episodes, without plans that are being made."""
     return Ahead(*(values[rows] for values in plan[:-1]))
 
 
@@ -365,15 +366,15 @@ def planner(
     rest: Mapping[str, float] | None = None,
     **numbers: Any,
 ) -> MPC:
-    """Return an MPC whose final cost is the distance from a rest; without weights there is none.
+    """Return an MPC whose final cost is the distance from a rest; without weights there is no final cost.
 
     Parameters
     ----------
     task : Task
         The task to control, with continuous actions.
     weights : mapping, optional
-        Final cost of the squared distance from rest, by entry of the state; for angles, which have the unit
-        rad, of twice 1 minus its cosine.
+        Final cost, by entry of the state: the weight of the squared distance from rest or, for angles
+        (entries with the unit rad), of twice 1 minus its cosine.
     rest : mapping, optional
         Nonzero entries of the state at rest.
     **numbers
@@ -382,14 +383,14 @@ def planner(
     Raises
     ------
     ValueError
-        For names that are not entries of the state, and a task with listed actions.
+        For names that are not entries of the state, and for a task with listed actions.
     """
     lost = away(task, weights or {}, rest or {})
     return MPC(task, lost if weights else None, **numbers)
 
 
 def loss(task: Task) -> Callable[[Array], Array]:
-    """Return the best regulator's loss of reward from states near upright; farther off, a larger one."""
+    """Return the best regulator's loss of reward from states near upright; farther away, a larger loss."""
     plans = plans_of(task)
     read, rest = ObservationDecoder(task), np.array(plans.rest)
     _, cost = regulator(smoothed(task), rest, extra=plans.extra)
@@ -397,7 +398,7 @@ def loss(task: Task) -> Callable[[Array], Array]:
     def lost(states: Array) -> Array:
         off = read.difference(states, rest)
         loss = np.einsum("...i,ij,...j->...", off, cost, off)
-        return loss + loss**2  # as the control is limited, a large loss means losing all
+        return loss + loss**2  # since the control is limited, a large loss means that all is lost
 
     return lost
 
@@ -411,12 +412,13 @@ def renewed(
     effort: float | None = None,
     **numbers: Any,
 ) -> MPC:
-    """Return an MPC that begins with a recorded plan, renews it in time, and leaves holding to a regulator.
+    """Return an MPC that starts with a recorded plan, renews it in time, and leaves holding to a regulator.
 
     Parameters
     ----------
     task : Task
-        The task, ``env.unwrapped.task``. Each episode begins with one of its recorded plans, or its image.
+        The task, ``env.unwrapped.task``. Each episode starts with one of its recorded plans, or a mirror
+        image.
     beyond : float
         How far to plan, as a multiple of the longest recorded plan.
     iterations : int

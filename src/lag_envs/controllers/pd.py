@@ -13,8 +13,8 @@ from lag_envs.tasks.base import Task
 class PD(FeedbackController):
     """Bring a place or an angle to its target like a critically damped spring.
 
-    The wanted acceleration is ω² (q* - q) - 2ω q'. The tilt of the plane or the rate of the shell that gives
-    it follows from the equation of motion, and the control brings it there.
+    The wanted acceleration is ω² (q* - q) - 2ω q'. The equation of motion gives the tilt of the plane, or the
+    rate of the shell, that produces this acceleration. The control brings tilt or rate to that value.
 
     Parameters
     ----------

@@ -51,11 +51,11 @@ class OwnLaw(FeedbackController):
 
 
 def value_at_start(task: PendulumRegret, *state: Array) -> Array:
-    """Return V of states, given by their entries (n,), which no policy exceeds."""
+    """Return V for states, given by their entries (n,); no policy exceeds it."""
     return task.value(_named(task, np.stack(state, axis=-1)), np)
 
 
 def _named(task: Task, states: Array) -> Values:
-    """Return states in the form that formulas take."""
+    """Return states in the form that the task's formulas take."""
     columns = np.moveaxis(np.asarray(states, np.float64), -1, 0)
     return Values("entry of the state", dict(zip(task.scene.state_names, columns, strict=True)))

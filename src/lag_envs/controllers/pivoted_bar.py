@@ -18,7 +18,7 @@ from lag_envs.tasks.pivoted_bar import SwingUp
 #: The upright rest, after the support's place and speed, if those are states.
 UPRIGHT = (0.0, 0.0, math.pi, 0.0)
 
-#: Thresholds of the LQR, and strength of pumping, with a track and without.
+#: Thresholds of the LQR and strength of pumping, with and without a track.
 TUNED = {True: (2.5, 1.5), False: (5.8, 3.8)}
 
 
@@ -26,10 +26,10 @@ class EnergyShapingLQR:
     """Pump a bar up to the energy of the upright rest, then hold it by a linear-quadratic regulator.
 
     Far from upright, the support is accelerated in the direction that does work on the bar [1]_, and, on a
-    track, softly back to its middle. Near upright the LQR takes over, and gives up only far outside its
-    range: distance is measured by the LQR's cost to go, and the two thresholds differ.
+    track, softly back to its middle. Near upright the LQR takes over, and it gives up only farther away.
+    Distance is measured by the LQR's cost to go, and the thresholds for taking over and giving up differ.
 
-    ``python -m agents.tune`` found the numbers, with a track and without.
+    The default numbers, with and without a track, were found by ``python -m agents.tune``.
 
     Parameters
     ----------
@@ -83,8 +83,8 @@ class EnergyShapingLQR:
     def swing(self, x: Array) -> Array:
         """Return the support's acceleration [m/s²] that brings the bar's energy to that of the upright rest.
 
-        Per moment of inertia the energy is E = θ'²/2 - ω₀² cosθ, and u changes it in proportion to
-        -u θ' cosθ.
+        The energy per moment of inertia is E = θ'²/2 - ω₀² cosθ, and u changes it in proportion to -u θ'
+        cosθ.
         """
         theta_dot, cosine = x[..., -1], np.cos(x[..., -2])
         missing = self.omega0_squared - (0.5 * theta_dot * theta_dot - self.omega0_squared * cosine)
@@ -105,7 +105,7 @@ class Estimate(NamedTuple):
     applied : ndarray, shape (n,)
         The control [m/s²] that acts from then on.
     under_way : ndarray, shape (n, steps of delay)
-        The requested controls that do not act yet, the oldest first.
+        The requested controls that do not act yet, oldest first.
     faded : ndarray, shape (n, 3)
         Sums over the steps with fading weights: of the regressors of q and γ, and of the change of θ'.
     information, weighed : ndarray, shapes (n, 2, 2) and (n, 2)
@@ -124,14 +124,14 @@ class Estimate(NamedTuple):
 
 
 class AdaptiveEnergyShapingLQR:
-    """Swing up a bar of unknown length and friction: estimate both on the way, and control by the estimate.
+    """Swing up a bar of unknown length and friction: estimate both while moving, and act on them.
 
     The bar moves by θ'' = -q (g sinθ + u cosθ) - γ θ', where q = m L/(m L² + I) follows from its length. This
     is linear in both unknowns, so least squares find them: over a step, θ' changes by q and γ times integrals
     of observed quantities. Changes are summed with fading weights, which is exact and reduces the effect of
     noise in single readings. Regulators are designed beforehand for several lengths in the drawn range, and
     interpolated in q. Delayed actions are taken into account: the state is predicted to the time at which the
-    next one acts.
+    next action takes effect.
 
     Parameters
     ----------
@@ -288,8 +288,8 @@ def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16)
     periods : float
         How far ahead to plan, in periods of a small swing of the hanging bar.
     opening : float
-        Duration of the first push of the support to either side, in such periods. The better side depends on
-        the start, and iLQR does not get from one to the other.
+        Duration of the first push of the support to either side, in such periods. Which side is better
+        depends on the start, and iLQR cannot change from one to the other.
     """
     follow = EnergyShapingLQR(task)
     steps = 2.0 * math.pi / math.sqrt(max(follow.omega0_squared, 1.0)) / task.dt
@@ -303,7 +303,7 @@ def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16)
 
 
 def from_upright(x: Array) -> Array:
-    """Return states relative to upright, the angle within ±π."""
+    """Return states relative to upright, with the angle within ±π."""
     off = x.copy()
     off[..., -2] = np.remainder(off[..., -2], 2.0 * math.pi) - math.pi
     return off

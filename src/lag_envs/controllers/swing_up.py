@@ -1,4 +1,4 @@
-"""Plans for swing-ups: on a task that is easier to plan for than one rewarding the fourth power of height."""
+"""Plans for swing-ups, on a task that is easier to plan for than if it rewards the height's fourth power."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ def easier(
 ) -> tuple[Task, Callable[[Array], Array]]:
     """Return a task that is easier to plan for, and the final cost of a plan.
 
-    A plan's end counts most, its course only a little. The control is weaker, so that the feedback has a
-    reserve with which to correct the plan.
+    In this task a plan's end counts most, and its course only a little. The control is weaker, so that the
+    feedback has a reserve for correcting the plan.
 
     Parameters
     ----------
     task : Task
         The task; its `plans` give the rest at which a plan should end.
     end : mapping
-        Final cost of each state entry: its squared distance from rest times this, for angles twice 1 minus
-        its cosine.
+        Final cost for each state entry: the weight of its squared distance from rest or, for angles, of twice
+        1 minus its cosine.
     effort : float
         Cost of a step with the largest control.
     share : float
         Largest control, as a share of the task's.
     walls : mapping, optional
-        Sizes of state entries; beyond nine tenths of them a step is penalised.
+        Limits of the sizes of state entries; steps beyond nine tenths of a limit are penalised.
     every : int
-        For how many of the task's steps each control is held.
+        Number of the task's steps for which each control is held.
     """
     kind: Any = type(task)
     check_single_control("easier", task)

@@ -1,4 +1,4 @@
-"""Follow a recorded plan by time-varying linear feedback; and find such plans."""
+"""Follow recorded plans by time-varying linear feedback, and find plans to record."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ FOLDER = Path(__file__).with_name("plans")
 class Tracking(Clocked):
     """Follow a plan by time-varying linear feedback, and hold its end by constant feedback.
 
-    Along the plan's states x_t the action is a_t - K_t (x - x_t), after the plan's end -K (x - rest); angles
-    that are observed only by cosine and sine are compared the shorter way around. All of it is data.
+    Along the plan's states x_t the action is a_t - K_t (x - x_t); after the plan's end it is -K (x - rest).
+    Angles that are observed only by cosine and sine are compared the shorter way around. The controller
+    consists of data only.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ class Tracking(Clocked):
     states : array_like, shape (steps + 1, n_state)
         The plan's states. Without any step, there is only the feedback at rest.
     actions : array_like, shape (steps,) or (steps, n_actions)
-        Its actions, without the last axis if they have one number.
+        The plan's actions, without the last axis if each has one number.
     gains : array_like, shape (steps, n_state) or (steps, n_actions, n_state)
         The feedback K_t, actions per deviation.
     rest : array_like, shape (n_state,)
@@ -45,7 +46,7 @@ class Tracking(Clocked):
         The feedback K there.
     """
 
-    #: Its numbers, by name.
+    #: The controller's numbers, by name.
     DATA = ("states", "actions", "gains", "rest", "hold")
 
     def __init__(
@@ -88,7 +89,7 @@ class Tracking(Clocked):
         Raises
         ------
         ValueError
-            If there is none, or if it is for a task with another state.
+            If the file does not exist, or if its plan is for a task with another state.
         """
         if not file.is_file():
             raise ValueError(f"there is no plan {file}; python -m agents.optimum {task.id} makes one")
@@ -145,17 +146,17 @@ def plans_of(task: Task) -> Plans:
 
 
 def plan_file(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
-    """Return the place of a task's plan: the one to follow, or the "quick" one as an initial guess."""
+    """Return the file of a task's plan: the plan to follow, or the "quick" plan as an initial guess."""
     return (folder or FOLDER) / f"{plans_of(task).of or task.id}-{kind}.npz"
 
 
 def recorded(task: Task, kind: str = "followed") -> Tracking:
-    """Return the controller that follows the recorded plan of a task's id."""
+    """Return the controller that follows the plan recorded for a task's id."""
     return Tracking.load(task, plan_file(task, kind))
 
 
 def hold(task: Task, plans: Plans | None = None) -> Tracking:
-    """Return the regulator that holds the end of plans, as `Task.plans` specifies, or others."""
+    """Return the regulator that holds the end of plans, as `Task.plans` or the given plans specify."""
     plans = plans or plans_of(task)
     return follow(task, [plans.rest], np.empty(0), plans)
 
