@@ -365,7 +365,7 @@ def proved_bound(env_id: str) -> tuple[float, str]:
     task: Task = TASKS[env_id]()
     if task.optimum is None:
         most = solvable()[env_id].most
-        return most * task.limit, f"steps of an episode; no step pays more than {most:g}"
+        return most * task.limit, f"no step of an episode pays more than {most:g}"
     states, _ = starts(env_id)
     place, text = task.optimum.place, task.optimum.text
     return float(resolve(place)(task, *states.T).mean()), f"{text} (`{place.replace(':', '.')}`)"

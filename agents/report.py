@@ -45,10 +45,10 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     parts = [
         "# Agents: what they reach",
         "<!-- Made by `python -m agents.results` from agents/results/summary.json. Do not edit by hand. -->",
-        "For each environment: how well every agent does, what it loses when it acts more often or when a"
-        " parameter, the noise or the delay changes, what its training took, and what is known about the"
-        " optimum. At the end: all environments in one figure, the learners compared, and how all of it was"
-        " measured.",
+        "This page shows for each environment how well every agent does, what it loses when it acts more"
+        " often or when a parameter, the noise or the delay changes, what its training took, and what is"
+        " known about the optimum. At the end there are a figure of all environments, a comparison of the"
+        " learners, and a description of how everything was measured.",
         _reading(),
     ]
     for env_id, env in envs.items():
@@ -63,7 +63,7 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         )
     parts += [
         "## All environments",
-        "Each agent's result, filled, and that of acting ten times as often, open:",
+        "Each agent's result (filled), and its result when acting ten times as often (open):",
     ]
     parts.append(_image("agents-scores.png", "Results of all agents with intervals"))
     if data["learners"]:
@@ -106,26 +106,27 @@ def summary_table(data: Data) -> str:
 def _reading() -> str:
     return (
         "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best known"
-        " policy, which need not be optimal. If no range is known, the tables show the return itself."
-        " Learners: interquartile mean over training seeds, and in brackets its"
-        f" {100 * LEVEL:g} % interval by a stratified bootstrap; mean return ± standard error over seeds"
-        " (a single run is treated like the other agents). A learner's name is followed by its seeds and"
-        " steps, in figures as seeds × thousands of steps: one seed says nothing about the next, and a"
-        " learner with fewer steps cannot be compared with one with more."
-        " Other agents have no training seeds, so only the episodes vary: mean, 1.96 standard errors"
-        " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
-        " a tenth; it reveals policies that exploit the discretisation. *Worst*: the lowest result under"
-        " changed parameters, noise and delay. *Training*: processor time of a run, the mean over its seeds;"
-        " the leaderboard has its wall time, which is longer where the machine also did other work."
-        " Fast PPO is `agents/ppo.py`, which commands know as `fast_ppo`."
+        " policy, which need not be optimal. Without a scale, the tables show the return itself. For"
+        " learners, the score is the interquartile mean over training seeds, in brackets its"
+        f" {100 * LEVEL:g} % interval by a stratified bootstrap, and the return is the mean ± standard error"
+        " over seeds (a single run is treated like the other agents). A learner's name is followed by its"
+        " seeds and steps, in figures as seeds × thousands of steps. One seed says nothing about the next,"
+        " and a learner with fewer steps cannot be compared with one with more. Other agents have no"
+        " training seeds, so only the episodes vary: their scores have an interval of 1.96 standard errors"
+        " to either side of the mean, and their returns the standard error over episodes. *Ten times as"
+        " often* is the same policy acting in steps of a tenth, which reveals policies that exploit the"
+        " discretisation. *Worst* is the lowest result under changed parameters, noise and delay. *Training*"
+        " is the processor time of a run, averaged over its seeds; the leaderboard has the wall time, which"
+        " is longer if the machine also did other work. Fast PPO is `agents/ppo.py`, which commands call"
+        " `fast_ppo`."
     )
 
 
 def _range(env_id: str, env: Data) -> str:
     if env["known"] is None:
-        return "No range is set for scores; the numbers are mean returns."
+        return "Scores have no scale yet; the numbers are mean returns."
     random, best = env["known"]
-    text = f"Score 0 is a mean return of {random:g}, score 1 one of {best:g}."
+    text = f"Score 0 is a mean return of {random:g}, score 1 a mean return of {best:g}."
     found, known = measured_entry(env_id).get("measured"), known_returns(env_id)
     if not found or not known or known.policy not in found:
         return text
@@ -178,7 +179,7 @@ def _times(env: Data) -> list[str]:
         rows.append(row)
     if not rows:
         return []
-    text = "Seeds whose tests reached a score, and the median over all seeds of the first such test:"
+    text = "How many seeds reached a score in a test, and the median over all seeds of the first such test:"
     return [text, markdown_table(["learner", *(f"{level:g}" for level in LEVELS)], rows)]
 
 
@@ -236,8 +237,8 @@ def _behaviour(env_id: str) -> list[str]:
         label = learner_label(name) + (f", {seeds} seeds" if seeds > 1 else "")
         rows.append([label, *map(cell, by.values())])
     text = (
-        f"In the same {found['episodes']:,} episodes (`python -m agents.behaviour`): means, unless"
-        " stated otherwise; for learners the range over their seeds."
+        f"How agents act in the same {found['episodes']:,} episodes (`python -m agents.behaviour`): means,"
+        " unless stated otherwise; for learners, the range over their seeds."
     )
     if any(name.startswith("lost") for name in head):
         text += " *Lost* is the sum of 1 minus the reward over the steps."
@@ -279,7 +280,7 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
             ]
         )
     text = (
-        "Over all environments with a score, each resampled by itself. **This is not a comparison of"
+        "Over all environments with a score, each of them resampled separately. **This is not a comparison of"
         " algorithms**: compare only results with the same environments, seeds and steps."
     )
     head = ["learner", f"score ({100 * LEVEL:g} %)", "environments", "seeds of each", "steps of a seed"]
@@ -309,8 +310,8 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
     if not rows:
         return "In every pair, all runs of one agent are better than all runs of the other."
     text = (
-        f"Probabilities other than 0 and 1, with {100 * LEVEL:g} % interval; two learners in the likelier"
-        " order:"
+        f"Probabilities other than 0 and 1, with {100 * LEVEL:g} % intervals. Of two learners, the first is"
+        " the one that is more likely to be better."
     )
     return text + "\n\n" + markdown_table(["environment", "learner", "better than", "probability"], rows)
 
@@ -318,30 +319,30 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
 def _method(data: Data) -> str:
     return "\n".join(
         [
-            f"- Episodes: {data['episodes']:,} under each condition, unless a table says otherwise. Their"
+            f"- Episodes: {data['episodes']:,} under each condition, unless stated otherwise. Their"
             f" seeds start at {data['first_seed']:,}, are never used in training and tuning, and are the same"
             " for all agents. Agents act deterministically.",
-            "- *Settings*: those of fast PPO were chosen with training seeds 0 and 1, which are among"
-            " the reported ones, though by other episodes: this may flatter its scores a little."
-            " Searches by `python -m agents.tune` now train with other seeds.",
+            "- *Settings*: those of fast PPO were chosen by trainings with seeds 0 and 1, which are"
+            " among the reported seeds. This may flatter its scores a little, although the choice was made by"
+            " other episodes. Searches by `python -m agents.tune` now train with other seeds.",
             *_fewer(data),
             "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their length in"
-            " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if any, differ"
-            " then, so an agent's luck differs too.",
-            "- *Parameters*: each of the scene's parameters 20 % lower and higher, the others unchanged; a"
-            " moment of inertia that is not given follows mass and size. The agents, and the range of scores,"
-            " are still those of the unchanged environment: part of a loss, or gain, comes from the changed"
-            " task itself.",
+            " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if any, are"
+            " then different, and so is an agent's luck.",
+            "- *Parameters*: each of the scene's parameters is made 20 % lower and higher, with the others"
+            " unchanged; a moment of inertia that is not given follows from mass and size. The agents and the"
+            " scale of scores remain those of the unchanged environment, so part of a loss or gain comes from"
+            " the changed task itself.",
             "- *Noise*: Gaussian, drawn anew for each entry of the observation at each step, with a standard"
-            " deviation of 1 % and 5 % of the entry's own under random actions (100 episodes).",
+            " deviation of 1 % or 5 % of that of the entry under random actions (100 episodes).",
             "- *Late*: the agent sees the observation of the step before.",
             f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, with environments as strata and"
             " seeds as elements, as in rliable (Agarwal et al., NeurIPS 2021); tests compare our functions"
             " with rliable's. The probability of improvement compares runs: an agent that was"
-            " not trained is one run. Learning curves use 20 test episodes with other seeds, and are linear"
-            " between tests.",
-            "- *First tests*: a run has 16, so a score may have been reached up to a sixteenth of the run"
-            " earlier, and the 20 episodes may be lucky. Seconds are processor time of training"
+            " not trained counts as one run. Learning curves use 20 test episodes with other seeds, and are"
+            " linear between tests.",
+            "- *First tests*: a run has 16 tests, so a score may have been reached up to a sixteenth of the"
+            " run earlier, and the 20 episodes may be lucky. Seconds are processor time of training"
             " alone, on one core (wall time for policies from before November 2026)."
             " `python -m agents.race` tests more often, one run at a time.",
             *_together(data),
@@ -372,10 +373,11 @@ def _fewer(data: Data) -> list[str]:
         found |= dict.fromkeys(some.items())
     if not found:
         return []
-    names = ", ".join(f"{name} in {n:,} episodes only" for name, n in found)
+    names = ", ".join(f"{name} {n:,}" for name, n in found)
     return [
-        f"- Under changed conditions {names}. Returns there are corrected by the difference between the"
-        " agent's return in these episodes and in all, both without the change."
+        f"- Under changed conditions some agents played fewer episodes: {names}. Their returns are corrected"
+        " by the difference between the agent's return in these episodes and in all episodes, both without"
+        " the change."
     ]
 
 
@@ -396,8 +398,8 @@ def _about(data: Data) -> str:
     trained = "\n".join(f"- {place}" for place in places)
     text = (
         f"Last measured on {machine['processor']}, {machine['cores']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {data['date']}. {versions}. Earlier rows stand as they were"
-        " measured, and seconds of training may be of different processors."
+        f" {machine['python']}; {data['date']}. {versions}. Earlier rows were not measured"
+        " again, and seconds of training may come from different processors."
     )
     return text + (f"\n\nTrained on:\n\n{trained}" if trained else "")
 
@@ -411,22 +413,23 @@ def _optimum(env_id: str) -> list[str]:
     if bound["exact"]:
         first = (
             f"It is known: {bound['value']:.4f} on average over the starts of {found['episodes']:,}"
-            f" episodes, {bound['why']}. No policy exceeds it; one that acts at intervals falls just short."
+            f" episodes, {bound['why']}. No policy exceeds it; a policy"
+            " that acts at intervals falls just short."
         )
     else:
-        first = f"The only proved bound is that it is at most {bound['value']:.4g}: {bound['why']}."
+        first = f"The only proved upper bound is {bound['value']:.4g}: {bound['why']}."
     if estimate is None:
-        second = f"Value iteration{easier} gives no estimate: its own policy gets more."
+        second = f"Value iteration{easier} gives no estimate: its greedy policy gets more."
     else:
         second = (
             f"Value iteration{easier} estimates {plus_minus(estimate['value'], estimate['error'])} for the"
-            f" starts of {found['episodes']:,} episodes: extrapolated to zero cell width, with the change by"
-            " the last halving of the cells as error bar. This is not a proof."
+            f" starts of {found['episodes']:,} episodes. This value is extrapolated to zero cell width, and"
+            " its error bar is how much the last halving of the cells changed it; it is not a proof."
         )
     parts = [first, second]
     if lower is not None:
         low, high = lower["interval"]
-        parts.append(f"Its greedy policy gets {lower['mean']:.6g} (95 % interval {low:.6g} to {high:.6g}).")
+        parts.append(f"The greedy policy gets {lower['mean']:.6g} (95 % interval {low:.6g} to {high:.6g}).")
     known = known_returns(env_id)
     if known is not None and estimate is not None:
         upper = min(bound["value"], estimate["value"] + estimate["error"])

@@ -361,7 +361,7 @@ def test_fewer_episodes_are_told():
         "C": {"agents": {"quick": agent(9, 9)}},
     }
     (line,) = report._fewer({"envs": envs})
-    assert "conditions slow in 2 episodes only, all of B in 3 episodes only. Returns" in line
+    assert "fewer episodes: slow 2, all of B 3. Their returns" in line
     assert report._fewer({"envs": {"C": envs["C"]}}) == []
 
 

@@ -1,4 +1,4 @@
-"""What a step of a chain costs, by the number of its bars: a section of ``lag-envs bench``."""
+"""The cost of a step of a chain, by the number of its bars: a section of ``lag-envs bench``."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _exponent(bars: Sequence[int], times: Sequence[float]) -> float:
 
 
 def cost_table(costs: Costs) -> list[tuple[str, ...]]:
-    """Return the times, with a head."""
+    """Return a table of the times; its first row is the head."""
     head, times = ["bars", "step, ns"], [[f"{ns:,.0f}" for ns in costs["ns"]]]
     if "series" in costs:
         head += ["series a step", "series, ns"]
@@ -90,12 +90,14 @@ def cost_table(costs: Costs) -> list[tuple[str, ...]]:
 
 def growth(costs: Costs) -> str:
     """Return how fast the times grow, in words."""
-    text = f"a step of a chain grows like its bars to the power {costs['exponent']:g}"
-    return text + (f", one series like the power {costs['series_exponent']:g}" if "series" in costs else "")
+    text = f"the time of a step grows as the number of bars to the power {costs['exponent']:g}"
+    return text + (
+        f", that of one series as the power {costs['series_exponent']:g}" if "series" in costs else ""
+    )
 
 
 def write_figure(costs: Costs, path: Path) -> None:
-    """Draw the times, beside the cube of the number of bars; the file depends only on them."""
+    """Draw the times and the cube of the number of bars; the file depends on nothing else."""
     import matplotlib
     from matplotlib.figure import Figure
 

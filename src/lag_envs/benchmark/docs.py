@@ -28,7 +28,7 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
 
 
 def other_processor(report: dict[str, Any]) -> str:
-    """Return docs/speed.md's sentences on a processor beside that of the table: its largest batches."""
+    """Return docs/speed.md's sentences on another processor, about the largest batches."""
     target = TARGETS[-1]
     ratios = reached_targets(report["rows"], target)
     shares = {row["id"]: 100 * row["share"][1] for row in report["arithmetic"]}
@@ -49,7 +49,7 @@ def other_processor(report: dict[str, Any]) -> str:
 
 
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
-    """Return the files of a checkout with a report's texts, as they should be."""
+    """Return the texts that a checkout's files should have for a report."""
     page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
     short = claim(report, " ([speed](docs/speed.md))")
     text = replaced(page.read_text(encoding="utf-8"), "bench", speed_markdown(report))
@@ -94,14 +94,16 @@ def speed_markdown(report: dict[str, Any]) -> str:
     peaks = [row["steps_per_second"][1] for row in report["rows"] if row["library"] == CORE and row["rates"]]
     peak = f", with a peak of {rate_text(peaks[0])} multiply-adds a second" if peaks else ""
     parts = [
-        "Time of a step, also as a multiple of the time of Gymnasium's `CartPole-v1` for as many "
+        "Time of a step, also as a multiple of the time of Gymnasium's `CartPole-v1` for equally many "
         f"environments: medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "
         f"{machine['processor']}{peak} (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, "
         f"{report['date']}).",
         markdown_table(["id", *sizes], lines),
     ]
     if told := list(filter(None, (_of_series(report["rows"], target) for target in SERIES_TARGETS))):
-        parts.append(f"Scenes defined by energies alone, beside the same `CartPole-v1`: {'; '.join(told)}.")
+        parts.append(
+            f"Scenes defined by energies alone, compared with the same `CartPole-v1`: {'; '.join(told)}."
+        )
     if costs := _with_series(report):
         head, *body = cost_table(costs)
         parts += [
@@ -124,7 +126,7 @@ def speed_markdown(report: dict[str, Any]) -> str:
 
 
 def _with_series(report: dict[str, Any]) -> Costs | None:
-    """Return the costs of chains if their series were counted."""
+    """Return the costs of chains, if their series were counted."""
     costs: Costs | None = report.get("chains")
     return costs if costs and "series" in costs else None
 
