@@ -397,7 +397,9 @@ def test_chains_in_the_documentation(tmp_path):
     ]
     costs = chain_costs.chain_costs(rows, {1: 1.0, 2: 2.0, 4: 4.0})
     text = docs.speed_markdown(report_of([2.0, 6.0, 3.0, 3.0]) | {"chains": costs})
-    assert "bars to the power 4, that of one series as the power 3" in text and "| 4 | 256 | 4.00 | 64 |" in text
+    assert (
+        "bars to the power 4, that of one series as the power 3" in text and "| 4 | 256 | 4.00 | 64 |" in text
+    )
     for name in ("a.svg", "b.svg"):
         chain_costs.write_figure(costs, tmp_path / name)
     drawn = (tmp_path / "a.svg").read_text()

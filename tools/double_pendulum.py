@@ -1,10 +1,10 @@
 """Check the tasks of the real double pendulum against its project's own simulator.
 
 ``python -m tools.double_pendulum CHECKOUT`` needs a checkout of
-github.com/dfki-ric-underactuated-lab/double_pendulum, and SciPy, SymPy and PyYAML. It compares parameters and
-accelerations, and runs the project's own LQR, with its friction compensation, from near upright on both its
-simulator, which takes a Runge-Kutta step in each control interval, and lag_envs's. It fails if the results
-differ by more than that integrator's error.
+github.com/dfki-ric-underactuated-lab/double_pendulum, and SciPy, SymPy and PyYAML. The command compares
+parameters and accelerations. It also runs the project's own LQR, with friction compensation, from near
+upright in the project's simulator, which takes a Runge-Kutta step in each control interval, and in lag_envs.
+The check fails if the results differ by more than that integrator's error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lag_envs.options import module_parser
 MODEL = Path("data/system_identification/identified_parameters/design_C.1/model_1.0/model_parameters.yml")
 #: The driven joint.
 ROBOTS = {"AcrobotReal-v0": 1, "PendubotReal-v0": 0}
-#: Order of the state in lag_envs, by the project's, (angles, rates).
+#: The order of lag_envs's state entries in the project's state (angles, rates).
 ORDER = [0, 2, 1, 3]
 START = [np.pi + 0.05, -0.03, 0.0, 0.0]
 #: Torque limit of the idle motor [N m], and the identified friction.
@@ -34,7 +34,7 @@ FRICTION = {"damping": 0.001, "damping_2": 0.001, "dry_friction": 0.16, "dry_fri
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the check; return 0 where everything agrees."""
+    """Run the check; return 0 if everything agrees."""
     parser = module_parser(
         "tools.double_pendulum", __doc__, "examples:\n  python -m tools.double_pendulum ../double_pendulum"
     )
@@ -60,8 +60,8 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
     limits[joint] = float(env.task.limit_control)
     model.set_torque_limit(limits)
     plant = DoublePendulumPlant(model_pars=model)
-    # Both motors and all friction: the project compensates that of the idle joint by its motor, lag_envs
-    # leaves it out.
+    # Both motors and all friction are used: the project compensates the idle joint's friction by the idle
+    # motor, while lag_envs leaves this friction out.
     names = parameter_values(env.scene)
     whole = type(env.scene)(control="both", **(names | FRICTION))
 
@@ -73,7 +73,7 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
         t0=0.0, x0=START, tf=env.task.duration, dt=env.task.dt, controller=published(model, joint)
     )
     path = np.array(states)[:, ORDER]
-    # Each of their steps, repeated from its start.
+    # Each of the project's steps is repeated from its start.
     alone = [whole.simulate(y, [u], env.task.dt)[1] for y, u in zip(path[:-1], torques, strict=True)]
     local = float(np.median(np.abs(np.array(alone) - path[1:]).max(axis=1)))
     print(f"  the project's torques on lag_envs, step by step: {local:.1e} apart in the median")
@@ -98,7 +98,7 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
 
 
 def accelerations(scene: Any, plant: Any) -> float:
-    """Return the largest difference of accelerations at random states, as a share of the largest one."""
+    """Return the largest difference of accelerations at random states, relative to the largest of them."""
     rng = np.random.default_rng(0)
     states = rng.uniform(-1.0, 1.0, (10_000, 4)) * [np.pi, 20.0, np.pi, 20.0]
     torques = rng.uniform(-6.0, 6.0, (len(states), 2))
@@ -137,7 +137,7 @@ def published(model: Any, joint: int) -> Any:
 
 
 def swing(measure: Any, times: Any, path: Any, parameters: Any) -> float:
-    """Return the project's swing-up time [s] of a path in our order."""
+    """Return the project's swing-up time [s] for a path in our order of entries."""
     return float(measure(T=np.array(times), X=path[:, ORDER], mpar=parameters, method="height", height=0.9))
 
 

@@ -1,7 +1,7 @@
-"""The generated data and pictures that each environment has or lacks: ``python -m tools.missing``.
+"""List the generated data and pictures that environments lack: ``python -m tools.missing``.
 
 A new environment works before anything is generated for it: pages say "not measured yet", and tests that
-compare with stored results use the environments that have them. Missing items are listed with the commands
+compare with stored results use the environments that have results. Missing items are listed with the commands
 that make them.
 """
 
@@ -121,7 +121,7 @@ def _measured_errors() -> Iterable[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the missing items; return 1 if there are any."""
+    """Print the missing items; return 1 if anything is missing."""
     module_parser("tools.missing", __doc__, "examples:\n  python -m tools.missing").parse_args(arguments)
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
     print(

@@ -1,7 +1,7 @@
 """Write the texts generated from the environments' records into README and docs: ``python -m tools.docs``.
 
 ``python -m tools.docs --pictures`` also draws the environments' moving pictures, from episodes of the
-leaderboard's best learned agents; with ids, only those of these environments.
+leaderboard's best learned agents; with ids, only for the given environments.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "examples:\n  python -m tools.docs\n  python -m tools.docs --pictures PivotedBar-v0",
     )
     parser.add_argument(
-        "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; all by default"
+        "--pictures", nargs="*", metavar="ID", help="draw moving pictures too, by default of all environments"
     )
     args = parser.parse_args(arguments)
     for env_id in args.pictures or ():
@@ -42,14 +42,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def generated(root: Path) -> dict[Path, str]:
-    """Return the generated files as they should be."""
+    """Return what the generated files should contain."""
     readme = root / "README.md"
     text = replaced(readme.read_text(encoding="utf-8"), "environments", by_scene(source))
     return {readme: text}
 
 
 def source(env_id: str) -> str:
-    """Return the place of an environment's record, for readers of README without the site."""
+    """Return the path of an environment's record, for those who read README without the site."""
     return f"src/{TASKS[env_id].__module__.replace('.', '/')}.py"
 
 

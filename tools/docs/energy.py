@@ -1,8 +1,8 @@
 """Gymnasium's environments and their counterparts here: one policy in both, and energy against time.
 
 ``python -m tools.docs.energy`` prints the returns of a task's reference controller in both, and draws
-``docs/images/energy-ID.png``. It plots the energy minus the control's work since the start, under random
-actions: these three systems have no friction, so the difference must stay constant.
+``docs/images/energy-ID.png``. The picture shows the energy minus the control's work since the start, under
+random actions. These three systems have no friction, so the difference must stay constant.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def with_peer() -> dict[str, str]:
 
 
 def returns(env_id: str, agent: Any, episodes: int) -> Array:
-    """Return an agent's returns in episodes with the seeds 0, 1, ..., each in an environment of its own."""
+    """Return an agent's returns in episodes with the seeds 0, 1, ..., each in a new environment."""
     envs = [gym.make(env_id) for _ in range(episodes)]
     seen = np.array([env.reset(seed=seed)[0] for seed, env in enumerate(envs)])
     total, going, memory = np.zeros(episodes), np.ones(episodes, np.bool_), None
@@ -51,10 +51,10 @@ def returns(env_id: str, agent: Any, episodes: int) -> Array:
 
 
 def energy_minus_work(scene: Scene, states: Array, controls: Array) -> Array:
-    """Return the energy minus the control's work [J] along states (n + 1, n_state), controls held between.
+    """Return the energy minus the control's work [J] along states (n + 1, n_state) with held controls.
 
     The control is a constant force or torque on coordinates, independent of the state, so its work in a step
-    is that force times their change.
+    is that force times the change of the coordinates.
     """
     layout = layout_of(scene)
     places = [layout.state.index(e) for e in layout.state if e.kind == "place"]
@@ -78,9 +78,9 @@ def _forces(scene: Any, control: float) -> dict[str, float]:
 
 
 def paths(env_id: str) -> dict[str, tuple[Array, Array]]:
-    """Return times [s] and balances [J] of the same random actions in both, over an episode's length.
+    """Return times [s] and balances [J] under the same random actions in both, over an episode's length.
 
-    Both start from the same state of mid-task motion, and continue past the end of an episode.
+    Both start from the same state in mid-motion, and continue past the end of an episode.
     """
     task = TASKS[env_id]()
     peer, original = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped

@@ -1,7 +1,7 @@
 """An environment's page, generated from its record: its design, its measurements, derived formulas.
 
-The headings are Gymnasium's. Prose is the docstring's, section by section; all tables, numbers and formulas
-come from the task, from ``measured.json``, from the board and from the accuracy report.
+The headings are Gymnasium's. The prose is taken from the docstring, section by section. All tables, numbers
+and formulas come from the task, from ``measured.json``, from the board and from the accuracy report.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ HEADINGS = (
     "Agents",
     "Version History",
 )
-#: Rows of the board that a page shows.
+#: Number of the board's rows that a page shows.
 TOP = 3
 
 
@@ -138,7 +138,7 @@ def overview(link: Callable[[str], str]) -> str:
 
 
 def by_scene(source: Callable[[str], str]) -> str:
-    """Return a short table: scenes and the ids of their tasks; `source` gives the address of an id's file."""
+    """Return a short table of scenes and their tasks' ids; `source` gives the address of an id's file."""
     files: dict[str, list[str]] = {}
     for env_id in TASKS:
         files.setdefault(source(env_id), []).append(env_id)
@@ -193,7 +193,7 @@ def _summary(env_id: str, task: Task) -> str:
 
 
 def _box(space: Any) -> str:
-    """Return a box without its bounds if they differ; the table below has them."""
+    """Return a box, without its bounds if they differ, as the table below has them."""
     ends = {float(x) for x in space.low}, {float(x) for x in space.high}
     if all(len(end) == 1 for end in ends):
         return (
@@ -371,7 +371,7 @@ def _returns(env_id: str) -> str:
 
 
 def _open(env_id: str) -> str:
-    """Return the statement that nobody has solved it, and the list of attempts."""
+    """Return the statement that nobody has solved the task, and the list of attempts."""
     task = TASKS[env_id]
     if task.open is None:
         return ""
@@ -433,7 +433,7 @@ def pages(data: Mapping[str, Any], root: Path = ROOT, env_ids: Iterable[str] = T
     root : Path, optional
         The checkout.
     env_ids : iterable of str, optional
-        Which ones; all by default.
+        Ids of the environments; all by default.
     """
     accuracy = json.loads((root / "docs" / "accuracy.json").read_text(encoding="utf-8"))
     boards = {one["id"]: one for one in data["environments"] if not one["frozen"]}

@@ -1,6 +1,6 @@
 """A scene's formulas as LaTeX, derived by SymPy from its Lagrangian, and LaTeX as MathML.
 
-Browsers draw MathML themselves, so a page needs no script and no font for its formulas.
+Browsers draw MathML themselves, so pages need neither script nor font for formulas.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.html import LOW, wrapped_mathml
 from tools.docs.markdown import groups, parameter_descriptions
 
-#: A letter by itself, which is the symbol that a docstring gives a parameter: "Mass m of the bar."
+#: A single letter, the symbol that a docstring gives a parameter, as in "Mass m of the bar."
 LETTER = re.compile(r"(?<![\w'/=])[A-Zb-zα-ωΑ-Ω](?![\w'/(=²])")
 
 

@@ -1,8 +1,8 @@
 """The recording of `docs/fit.md` and the picture of its residuals: ``python -m tools.docs.fit``.
 
-There is no real recording that could be passed on. This one is simulated with SciPy's integrator from the
-textbook's equation, not with this package. It then gets the flaws of a film: noise, rounding to tenths of
-degrees, lost frames.
+No real recording is available that could be published. This recording is simulated with SciPy's integrator
+from the textbook's equation, not with this package. It is then given the flaws of a film: noise, rounding to
+tenths of degrees, lost frames.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hooks that MkDocs calls to build the site: they add generated pages, the root's files and the board."""
+"""Hooks that MkDocs calls to build the site; they add generated pages, files of the root, and the board."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ sys.path[:0] = [str(ROOT / "src"), str(ROOT)]
 #: Files of the checkout that become pages of the site too.
 ROOT_FILES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "NOTICE.md": "notice.md"}
 SOURCE = "https://github.com/lag-envs/lag-envs/blob/main/"
-#: Places of the leaderboard's page and of the environments' pages.
+#: Paths of the leaderboard's page and of the environments' pages.
 BOARD, ENVIRONMENTS = "board", "environments"
 MOVING = "images/moving"
 #: The longest description of a page.
@@ -40,7 +40,7 @@ def board() -> dict[str, Any]:
 
 @cache
 def generated() -> dict[str, str]:
-    """Return the generated pages, by their place in the site."""
+    """Return the generated pages, by their path in the site."""
     from tools.docs import environments, scenes
 
     found = {
@@ -62,7 +62,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the generated pages, and those from the root."""
+    """Add the generated pages, and pages from the root."""
     texts = generated() | {
         place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_FILES.items()
     }
@@ -99,9 +99,9 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Give moving pictures their stills; docs/assets/docs.js adds a button. Write minus signs.
+    """Add stills to moving pictures (docs/assets/docs.js adds a button), and write minus signs.
 
-    Other pictures are links to their files, as small screens show them too small to read.
+    Other pictures become links to their files, because on small screens they are too small to read.
     """
     html = re.sub(
         rf'<p>(<img [^>]*src="((?:(?!{MOVING})[^"])+)"[^>]*>)</p>', r'<p><a href="\2">\1</a></p>', html
@@ -146,7 +146,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def with_lazy_pictures(html: str) -> str:
-    """Return HTML whose pictures are loaded when they come near, except the first: it may be in view."""
+    """Return HTML whose pictures are loaded when they come near, except the first, which may be in view."""
     first, image, rest = html.partition("<img ")
     return first + image + rest.replace("<img ", '<img loading="lazy" ')
 
@@ -160,13 +160,13 @@ def with_minus(html: str) -> str:
     '<td>−1266.5, 1e-6, 2026-11-26 <code>-1</code></td>'
     """
     parts = re.split(r"(<(code|annotation)\b.*?</\2>|<[^>]*>)", html, flags=re.DOTALL)
-    # The text, and after each text two groups: code or a tag, and the name in it.
+    # The texts; after each text come two groups: code or a tag, and the name in it.
     parts[::3] = [re.sub(r"(?<![\w.-])-(?=[\d∞])", "−", text) for text in parts[::3]]
     return "".join(text for i, text in enumerate(parts) if i % 3 != 2 and text)
 
 
 def description(page: Page, markdown: str) -> str:
-    """Return what a page is about: an environment's first line, or the first sentences of the text."""
+    """Return a page's description: an environment's first line, or the first sentences of the text."""
     from lag_envs.tasks import TASKS
 
     if page.title in TASKS:
@@ -185,7 +185,7 @@ def description(page: Page, markdown: str) -> str:
 
 
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
-    """Add the board, which is built beside the pages, and the guide to it."""
+    """Add the board, which is built separately from the pages, and the guide to it."""
     for section in nav.items:
         if section.title == "Leaderboard" and section.children is not None:
             section.children.insert(0, Link("Board", f"{BOARD}/index.html"))
@@ -216,7 +216,7 @@ def on_post_template(output_content: str, template_name: str, config: MkDocsConf
 
 
 def with_search_name(html: str) -> str:
-    """Return a page whose search has a name for screen readers; the theme leaves it without one."""
+    """Return a page whose search has a name for screen readers, which the theme omits."""
     search = 'data-md-component="search" role="dialog"'
     return html.replace(search, f'{search} aria-label="Search"')
 

@@ -15,7 +15,7 @@ def first_line(kind: type) -> str:
 
 
 def sections(kind: type) -> dict[str, str]:
-    """Return a docstring's text by its ``##`` headings; text before them has the empty heading."""
+    """Return a docstring's text by its ``##`` headings; text before the first has an empty heading."""
     parts = re.split(r"^## (.+)$", inspect.getdoc(kind) or "", flags=re.MULTILINE)
     return dict(zip(["", *parts[1::2]], (part.strip() for part in parts[::2]), strict=True))
 

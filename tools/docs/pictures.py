@@ -16,14 +16,14 @@ from lag_envs.tasks import TASKS
 
 #: Frames per second, and the largest file [bytes].
 RATE, LARGEST = 15, 300_000
-#: Above this score, a learned agent is shown instead of the best of all.
+#: If a learned agent's score is above this, it is shown instead of the best agent of all.
 GOOD = 0.8
-#: Widths [pixels], qualities, and strides of frames; the first that makes a small enough file is taken.
+#: Widths [pixels], qualities, and strides of frames; the first combination with a small enough file is used.
 CHOICES = ((480, 60, 1), (480, 40, 1), (400, 40, 1), (360, 30, 1), (360, 30, 2), (320, 20, 3))
 
 
 def draw_environments(board: Path, folder: Path, envs: Collection[str]) -> None:
-    """Draw environments of a board: the best learned agent if it is good, otherwise the best of all."""
+    """Draw environments of a board: with the best learned agent if it is good, otherwise the best of all."""
     folder.mkdir(parents=True, exist_ok=True)
     for found in board_data(Board(board))["environments"]:
         rows = [row for row in found["rows"] if row["replays"] and row["rank"] is not None]

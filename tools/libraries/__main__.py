@@ -1,6 +1,6 @@
 """Run every library that we name, with its own scripts, on our environments: ``make test-libraries``.
 
-`libraries.toml` lists the packages to install, each library in a virtual environment of its own in
+`libraries.toml` lists the packages to install, each library in its own virtual environment in
 ``.venv-libraries``, and the scripts to run. Scripts that no wheel contains are downloaded at a fixed commit
 and checked against a digest. If a script or a library is not available, the table says so.
 """
@@ -41,17 +41,17 @@ QUIET = {
     "RAY_AUTH_MODE": "disabled",
     "RAY_USAGE_STATS_ENABLED": "0",
     "PYTHONUNBUFFERED": "1",
-    # The networks are small: threads would only wait for each other.
+    # The networks are small, so threads would only wait for each other.
     "OMP_NUM_THREADS": "1",
 }
 
 
 class NotRun(Exception):
-    """Something that a run needs is not available; the text says what."""
+    """Raised if something that a run needs is not available; the text says what."""
 
 
 class Failed(Exception):
-    """A run failed; the text says how."""
+    """Raised if a run failed; the text says how."""
 
 
 def libraries() -> dict[str, Any]:
@@ -74,7 +74,7 @@ def install(name: str, library: dict[str, Any], wheel: Path) -> Path:
             _quietly([sys.executable, "-m", "venv", "--clear", home])
         _quietly([*pip, *pins])
         stamp.write_text(json.dumps(pins))
-    # pip checks our requirements, except if a library's own pins are older than they allow.
+    # pip checks our requirements, unless a library pins older versions than they allow.
     _quietly([*pip, "--force-reinstall", "--no-deps", wheel])
     if not library.get("older", False):
         _quietly([*pip, wheel])
@@ -131,7 +131,7 @@ def scripts(entry: dict[str, Any]) -> dict[str, str]:
     for old, new in entry.get("replace", []):
         places = [name for name, text in texts.items() for _ in range(text.count(old))]
         if len(places) != 1:
-            raise Failed(f"{old!r} is to be replaced in one place, and stands in {len(places)}")
+            raise Failed(f"{old!r} must occur once to be replaced, but occurs {len(places)} times")
         texts[places[0]] = texts[places[0]].replace(old, new)
     return texts
 
@@ -140,7 +140,7 @@ def scripts(entry: dict[str, Any]) -> dict[str, str]:
 
 
 def run(name: str, number: int, entry: dict[str, Any], programs: Path) -> float:
-    """Carry out one run in a folder of its own and return how long it took [s]."""
+    """Carry out one run in its own folder and return how long it took [s]."""
     folder = HOME / "runs" / f"{name}-{number}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -160,7 +160,7 @@ def run(name: str, number: int, entry: dict[str, Any], programs: Path) -> float:
             status: int | None = process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             status = None
-        finally:  # end everything that it has left running
+        finally:  # end all processes that it has left running
             try:
                 os.killpg(process.pid, signal.SIGKILL)
             except ProcessLookupError:
@@ -242,7 +242,7 @@ def write_results(found: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all libraries, or some; return 1 if a run failed, or none was possible."""
+    """Run all libraries, or some; return 1 if a run failed or if no run was possible."""
     known = libraries()
     parser = argparse.ArgumentParser(
         prog="make test-libraries ARGS=...",

@@ -1,7 +1,7 @@
-"""Every wrapper of Gymnasium, single and vector, around each of our environments; its checkers; its `play`.
+"""Test every wrapper of Gymnasium, single and vector, around each environment; its checkers; its `play`.
 
-``python gymnasium_wrappers.py single|vector|checkers|play``. A wrapper that is not listed here is an error,
-so that no wrapper of a new release is missed.
+``python gymnasium_wrappers.py single|vector|checkers|play``. A wrapper that is not listed here causes an
+error, so that no wrapper of a new release is missed.
 """
 
 import sys
@@ -33,7 +33,7 @@ def pixels(env):
 
 
 def image(envs):
-    """Return a vector environment whose observations are made pictures, as some wrappers require."""
+    """Return a vector environment whose observations are turned into pictures, as some wrappers require."""
     one = spaces.Box(0, 255, (16, 16, 3), np.uint8)
     many = spaces.Box(0, 255, (envs.num_envs, 16, 16, 3), np.uint8)
     show = lambda o: np.broadcast_to(np.uint8(127 * np.tanh(o[:, :1]) + 128)[:, None, None], many.shape)  # noqa: E731
@@ -89,7 +89,7 @@ SINGLE = {
     "JaxToNumpy": lambda e: single.JaxToNumpy(single.ArrayConversion(e, np, jnp)),
     "JaxToTorch": lambda e: single.JaxToTorch(single.ArrayConversion(e, np, jnp)),
 }
-#: How each is applied to a vector environment.
+#: How each wrapper is applied to a vector environment.
 VECTOR = {
     "VectorizeTransformObservation": lambda e: vector.VectorizeTransformObservation(
         e, single.ReshapeObservation, shape=(1, *e.single_observation_space.shape)
@@ -124,7 +124,7 @@ VECTOR = {
     "JaxToNumpy": lambda e: vector.JaxToNumpy(vector.ArrayConversion(e, np, jnp)),
     "JaxToTorch": lambda e: vector.JaxToTorch(vector.ArrayConversion(e, np, jnp)),
 }
-#: These take or return something other than NumPy arrays, and their spaces do not say so.
+#: Wrappers that take or return something other than NumPy arrays although their spaces do not say so.
 OTHER_ARRAYS = ("ArrayConversion", "NumpyToTorch", "JaxToTorch")
 
 
@@ -158,13 +158,13 @@ def play_episodes(env, tensors):
 
 
 def wrappers(kind):
-    """Step every environment inside every wrapper, vector ones in all autoreset modes."""
+    """Step every environment inside every wrapper, vector environments in all autoreset modes."""
     module, recipes = (single, SINGLE) if kind == "single" else (vector, VECTOR)
     names = listed(module, recipes)
     known_failures = set()
     for env_id in lag_envs.TASKS:
         for name in names:
-            # JAX compiles for a second, so one environment has to do.
+            # JAX compiles for a second, so only one environment is used.
             if "Jax" in name and env_id != "PivotedBar-v0":
                 continue
             tensors = name in OTHER_ARRAYS
@@ -238,7 +238,7 @@ def play():
 
 
 if __name__ == "__main__":
-    # Gymnasium warns about an environment by UserWarning. Other warnings come from what its wrappers do.
+    # Gymnasium warns about an environment by UserWarning. Other warnings are caused by its wrappers.
     warnings.simplefilter("error", UserWarning)
     warnings.filterwarnings(
         "ignore", ".*will not contain the last frame", UserWarning

@@ -13,7 +13,7 @@ for env_id, options in [
     env = DataCollector(gym.make(env_id, **options))
     env.action_space.seed(1)
     for _ in range(3):
-        env.reset()  # with a seed of 64 bits that Minari draws and keeps
+        env.reset()  # with a 64-bit seed that Minari draws and stores
         done = False
         while not done:
             action = env.action_space.sample()

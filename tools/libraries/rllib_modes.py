@@ -1,11 +1,11 @@
-"""RLlib's PPO with each way to step many environments: in turn, in processes, our native vector one."""
+"""RLlib's PPO with each way to step many environments: in turn, in processes, and natively as a vector."""
 
 import ray
 from ray.rllib.algorithms.ppo import PPOConfig
 
 
 def main():
-    """Take two updates in each mode."""
+    """Make two updates in each mode."""
     ray.init(num_cpus=2, include_dashboard=False)
     for mode in ("sync", "async", "vector_entry_point"):
         config = (

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
-    """Return batches of shape (n, 1), uniform in [-scale, scale]; there are enough not to repeat too soon.
+    """Return batches of shape (n, 1), uniform in [-scale, scale], so many that they do not repeat too soon.
 
     A few batches repeated over and over would act as a periodic force, which drives pendulums into resonance,
     to speeds at which steps are divided.
@@ -18,7 +18,7 @@ def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
 
 
 def actions_of(space: gym.Space, n: int) -> list[NDArray]:
-    """Return batches of n random actions of a space: uniform numbers, or choices."""
+    """Return batches of n random actions from a space: uniform numbers, or choices."""
     some = random_actions(n)
     if isinstance(space, gym.spaces.Discrete):
         return [((a[:, 0] + 1.0) * 0.5 * int(space.n)).astype(np.int64).clip(0, space.n - 1) for a in some]

@@ -37,9 +37,9 @@ def chain_costs(rows: Sequence[dict[str, Any]], series: Mapping[int, float] | No
     Returns
     -------
     dict or None
-        ``bars``, ``ns`` a step and the ``exponent`` of its best fit by a power law. If `series` is given,
-        also that as a list, and ``series_exponent`` for the time of one series. None for fewer than two
-        chains.
+        ``bars``, the time ``ns`` of a step, and the ``exponent`` of the best fit of these times by a power
+        law. If `series` is given, also `series` as a list, and ``series_exponent`` for the time of one
+        series. None for fewer than two chains.
 
     Examples
     --------

@@ -10,12 +10,12 @@ from lag_envs.tasks import Task
 
 
 class ChainSwing(Task):
-    """Bars hanging from a support that is pushed to and fro; they start anywhere, turning fast."""
+    """Bars hanging from a support that is pushed to and fro; they start at any angles, turning fast."""
 
     scene: Any = Chain
     interval, steps = 0.02, 500
     action: ClassVar = {"s_ddot": 5.0}
-    order = 18  # the bars turn fast: 16 takes a little longer
+    order = 18  # since the bars turn fast; 16 takes a little longer
 
     @property
     def start(self) -> dict[str, float]:
@@ -32,7 +32,7 @@ class ChainSwing(Task):
         return found
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return the height of the chain's end minus a cost for being off the middle."""
+        """Return the height of the chain's end minus a cost for distance from the middle."""
         height = sum(-xp.cos(after[name]) for name in self.scene.coordinates)
         return height - 0.1 * after.s**2
 

@@ -59,10 +59,10 @@ def cold_starts(id: str, count: int, times: dict[str, list[list[float]]], files:
 
 
 def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
-    """Return the seconds of each of `STAGES` of a process that takes one step."""
+    """Return the seconds of each of `STAGES` in a process that takes one step."""
     load = "".join(f"from lag_envs.own_files import registered; registered({name!r})\n" for name in files)
     command = [sys.executable, "-P", "-c", COLD_START.format(id=id, load=load)]
-    # As with installed packages, imported modules have their bytecode: it is written first where missing.
+    # As in installed packages, imported modules have their bytecode; missing bytecode is written first.
     given = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     given["NUMBA_CACHE_DIR"] = cache
     start = time.perf_counter()
@@ -73,7 +73,7 @@ def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
 
 
 def start_summary(times: Sequence[Sequence[float]]) -> dict[str, Any]:
-    """Return the seconds of each process, their median, and that of each of `STAGES`."""
+    """Return the seconds of each process, their median, and the median of each of `STAGES`."""
     seconds = [sum(stages) for stages in times]
     parts = zip(STAGES, zip(*times, strict=True), strict=True)
     return {

@@ -16,7 +16,7 @@ from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant, Run
 def contestants(
     ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = (), threads: int = 1
 ) -> list[Contestant]:
-    """Return our environments, also with other keywords and several threads, and the peers."""
+    """Return our environments, also with other keywords and with several threads, and the peers."""
 
     def batches(library: str, name: str, prepare: Callable[[int], Run]) -> list[Contestant]:
         return [Contestant(library, name, "vector", n, partial(prepare, n)) for n in sizes]

@@ -2,9 +2,9 @@
 
 The rate is that of whole steps as in training: control, motion, reward, observation, ending, kick and
 restarts, with random actions, at all times of the episodes. It is measured in two ways, in turn: calling
-`step`, and replaying a CUDA graph of it, which leaves out Python's share. Beside both stands the data that
-such a step has to read and write, as a share of the memory bandwidth, which is measured by copying in the
-same run.
+`step`, and replaying a CUDA graph of it, which leaves out Python's share. For both, the result includes the
+data that a step has to read and write, as a share of the memory bandwidth. The bandwidth is measured by
+copying in the same run.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from lag_envs.device import DeviceEnvs
 from lag_envs.errors import one_line
 from lag_envs.progress import progress
 
-#: Numbers copied to measure the memory, more than any cache holds.
+#: How many numbers are copied to measure the bandwidth; no cache holds that many.
 COPIED = 2**28
-#: Bytes of an environment besides its numbers: its age, read and written, and four booleans.
+#: Bytes of an environment besides its numbers: its age, which is read and written, and four booleans.
 FLAGS = 4 + 4 + 4
-#: Environments that go through an episode before a measurement, to provide states, and its maximum length.
+#: Number of environments that provide states by an episode before a measurement, and its maximum length.
 FEW, LONGEST = 4096, 1000
-#: Batches of random actions, used in turn while time is measured.
+#: Number of batches of random actions, used in turn while time is measured.
 BATCHES = 16
 
 Run = Callable[[], Any]
@@ -38,7 +38,7 @@ def measured(
 ) -> dict[str, Any]:
     """Measure environments on a GPU, in single and in double precision.
 
-    What fails has its error in its row. An interrupt ends the measurement.
+    If an environment fails, its row has the error. An interrupt ends the measurement.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def measured(
     seconds : float
         Target length of a sample.
     rounds : int
-        Samples of each; the median counts.
+        Samples of each environment; the median counts.
 
     Returns
     -------
@@ -110,10 +110,10 @@ def _copying(device: torch.device) -> Run:
 
 
 def _under_way(env_id: str, size: int, device: torch.device, dtype: torch.dtype) -> DeviceEnvs:
-    """Return environments whose episodes are under way, with the states that random actions lead to.
+    """Return environments in the middle of episodes, with the states that random actions lead to.
 
-    Some go through a whole episode, or the first `LONGEST` steps of one, ending it at different times. The
-    others are copies of these.
+    Some environments go through a whole episode, or its first `LONGEST` steps, and stop at different times.
+    The others are copies of these environments.
     """
     torch.manual_seed(0)
     few, envs = (
@@ -154,7 +154,7 @@ def _stepping(envs: DeviceEnvs) -> Run:
 
 
 def _in_graph(run: Run, device: torch.device) -> Run:
-    """Return a function that replays steps recorded in a CUDA graph; without a GPU, the steps."""
+    """Return a function that replays steps recorded in a CUDA graph; without a GPU it takes the steps."""
     if device.type != "cuda":
         return run
     graph = torch.cuda.CUDAGraph()
@@ -164,7 +164,7 @@ def _in_graph(run: Run, device: torch.device) -> Run:
 
 
 def _rates(runs: Sequence[Run], device: torch.device, seconds: float, rounds: int) -> list[float]:
-    """Return how often per second functions can be called: medians of samples of a given length, in turn."""
+    """Return how often per second functions can be called: medians of interleaved samples of a given length."""
 
     def wait() -> None:
         if device.type == "cuda":

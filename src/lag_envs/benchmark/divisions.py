@@ -1,6 +1,6 @@
 """How often the certificate divides steps, and the cost of this: a section of ``lag-envs bench``.
 
-A step is divided if a single series would have too large a truncation error, as when a chain whips.
+A step is divided if a single series would have too large a truncation error, for example when a chain whips.
 `Scene.step_bound` gives the number of parts.
 """
 
@@ -17,7 +17,7 @@ from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 from lag_envs.workers import stopping_point
 
-#: Environments of a batch under random actions, and the interval of steps that are examined.
+#: Number of environments in a batch under random actions, and every how many steps one is examined.
 BATCH, EVERY = 16, 5
 
 
@@ -27,14 +27,15 @@ def divisions(ids: Sequence[str]) -> list[dict[str, Any]]:
     Parameters
     ----------
     ids : sequence of str
-        Environments of the package; those with imperfections are left out, since their steps are also divided
-        where commands change.
+        Environments of the package. Environments with imperfections are left out, since their steps are also
+        divided when commands change.
 
     Returns
     -------
     list of dict
-        For each one ``id``; ``mean`` and ``most`` substeps of a step, ``divided``, the share of steps with
-        more than one, and ``fastest``, the largest velocity that occurred [SI].
+        For each environment its ``id``; ``mean`` and ``most``, the mean and largest number of substeps of a
+        step; ``divided``, the share of steps with more than one; and ``fastest``, the largest velocity that
+        occurred [SI].
     """
     return [
         {"id": env_id} | divided(gym.make_vec(env_id, BATCH, autoreset_mode="SameStep").unwrapped)
@@ -57,7 +58,7 @@ def divided(envs: Any) -> dict[str, Any]:
         _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
         fastest = max(fastest, float(np.abs(before[:, fast]).max()))
         if step % EVERY == 0:
-            going = ~(terminated | truncated)  # the others have lost their control
+            going = ~(terminated | truncated)  # the other environments have lost their control
             held = zip(before[going], envs.control[going], strict=True)
             parts += [int(scene.step_bound(state, control, dt).substeps) for state, control in held]
     envs.close()

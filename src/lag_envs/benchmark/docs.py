@@ -1,4 +1,4 @@
-"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md, README's summary."""
+"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md and README's summary."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def speed_markdown(report: dict[str, Any]) -> str:
     Parameters
     ----------
     report : dict
-        The result of `bench`; of these sizes, including CartPole-v1.
+        The result of `bench` for these sizes, including CartPole-v1.
     """
     rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
     rival = ("gymnasium", "CartPole-v1")

@@ -10,7 +10,7 @@ from lag_envs.benchmark.environments import stepped
 from lag_envs.benchmark.rounds import ENERGIES, Contestant, Run
 from lag_envs.envs.vector import LagrangianVectorEnv
 
-#: The task with chains, and the bars of the longest one.
+#: The task with chains, and the number of bars of the longest chain.
 CHAIN, LONGEST = "lag_envs.benchmark.chain_swing:ChainSwing", 6
 
 

@@ -26,7 +26,7 @@ def unwrapped(id: str, **keywords: Any) -> Run:
 
 def own_single(env: gym.Env) -> Run:
     """Prepare one environment with Gymnasium's interface."""
-    # A choice as Python's int, as users give it.
+    # A choice is a Python int, as users give it.
     endless = cycle([a[0].item() if a.ndim == 1 else a[0] for a in actions_of(env.action_space, 1)])
     env.reset(seed=0)
 
@@ -54,7 +54,7 @@ def stepped(envs: VectorEnv) -> Run:
 
 
 def stagger_episodes(envs: VectorEnv, actions: Sequence[Any]) -> None:
-    """Stagger the episodes, so that every sample has its share of endings."""
+    """Stagger the episodes, so that every sample contains its share of endings."""
     limit = envs.spec.max_episode_steps if envs.spec else None
     length = limit or round(envs.task.limit)  # type: ignore[attr-defined]
     turn = np.arange(envs.num_envs) * length // envs.num_envs

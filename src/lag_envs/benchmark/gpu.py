@@ -63,7 +63,7 @@ def with_table(page: str, report: dict[str, Any]) -> str:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
-    """Return rates and shares of the bandwidth: of steps that are called, and in a CUDA graph."""
+    """Return rates and shares of the bandwidth, for steps that are called and for steps in a CUDA graph."""
     if "problem" in row:
         return [row["problem"], "", "", ""]
     return [
@@ -74,7 +74,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _about(report: dict[str, Any]) -> str:
-    """Return one line on the machine and the measurement."""
+    """Return one line about the machine and the measurement."""
     settings = report["settings"]
     return (
         f"{report['gpu']}, bandwidth {report['bandwidth'] / 1e12:.2f} TB/s (read and written); "

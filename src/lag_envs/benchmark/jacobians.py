@@ -1,8 +1,8 @@
 """The cost of a control step's derivatives, relative to the step: two sections of ``lag-envs bench``.
 
-In the first section, both start from the same states. The step is the compiled one, called for each state;
-`Scene.simulate` would follow a single motion. The second section has whole steps: those of a vector
-environment, and the same steps backwards.
+In the first section, a step and its derivatives start from the same states. The compiled step is called for
+each state, because `Scene.simulate` would follow a single motion. The second section compares whole steps of
+a vector environment with the same steps backwards.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from lag_envs.stepping.flows import lift_lines
 from lag_envs.tasks import TASKS
 from lag_envs.workers import stopping_point
 
-#: Length of the step [s], states in a batch, and calls in a sample of single ones.
+#: Length of the step [s], states in a batch, and calls in a sample of single steps.
 DT, BATCH, CALLS = 0.02, 1024, 20
-#: Environments whose whole steps are differentiated, and steps from which they start.
+#: Number of environments in a batch of whole steps, and of the steps from which they are differentiated.
 ENVS, STEPS = 16384, 8
 #: Scenes of the package, each with its most expensive control.
 CASES: dict[str, Callable[[], Scene]] = {
@@ -43,7 +43,7 @@ CASES: dict[str, Callable[[], Scene]] = {
 
 
 def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
-    """Return a function that takes a step from each of many states, and returns the sum of the results."""
+    """Return a function that takes a step from each of many states and returns the sum of the results."""
     code, constants = code_of(scene, dt), motion_constants_of(scene)
     numbers = [constants[name.removeprefix("k_")] for name in code.constants]
     form, n = form_of(scene), len(scene.state_names)
@@ -75,7 +75,7 @@ def jacobians(rounds: int, clock: Callable[[], float]) -> list[dict[str, Any]]:
     Parameters
     ----------
     rounds : int
-        Number of rounds; all are measured in turn, and the shortest time counts.
+        Number of rounds; in each, all scenes are measured in turn, and the shortest time counts.
     clock : callable
         Returns the time [s].
 
@@ -83,8 +83,9 @@ def jacobians(rounds: int, clock: Callable[[], float]) -> list[dict[str, Any]]:
     -------
     list of dict
         For each scene its ``name``; ``columns`` K, by states and controls; ``step_ns`` and ``jacobian_ns`` of
-        a row of a batch, ``ratio`` and its ``aim`` 1 + 2K; ``call_us`` of one call, and ``call_ratio`` to one
-        of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which should be at most 4.
+        a row of a batch, ``ratio`` and its ``aim`` 1 + 2K; ``call_us`` of one call, and ``call_ratio``, its
+        ratio to a call of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which should be
+        at most 4.
     """
     return [_cost(name, rounds, clock) for name in CASES]
 
@@ -142,15 +143,15 @@ def backwards(
     rounds, clock
         As for `jacobians`.
     ids : sequence of str
-        Environments; by default all whose steps have derivatives.
+        Ids of environments; by default of all whose steps have derivatives.
     count : int
-        How many of each there are in a batch.
+        Number of environments in a batch.
 
     Returns
     -------
     list of dict
-        For each its ``id``; ``step_ns`` and ``back_ns`` for each environment; ``ratio``, which should be at
-        most 4.
+        For each environment its ``id``; ``step_ns`` and ``back_ns`` for each environment; ``ratio``, which
+        should be at most 4.
     """
     smooth = [name for name, kind in TASKS.items() if not kind().formulas.choices and not kind.imperfections]
     return [_backwards(name, rounds, clock, count) for name in ids or smooth]
@@ -177,7 +178,7 @@ def _backwards(name: str, rounds: int, clock: Callable[[], float], count: int) -
         for i, action in enumerate(actions):
             reverse.pull(states[i], action, targets, states[i + 1], states[i + 1], *seeds)
 
-    # Both from the same states: how a step is divided depends on them.
+    # Both start from the same states, since these determine how a step is divided.
     times = _least((step, back), rounds, clock, before=lambda: envs.reset(seed=0))
     step_ns, back_ns = (1e9 * x / STEPS / count for x in times)
     return {

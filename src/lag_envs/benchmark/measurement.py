@@ -53,7 +53,7 @@ class BenchmarkSettings:
 def bench(settings: BenchmarkSettings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return its contents.
 
-    Whatever fails or interrupts it, what was measured before is printed and written.
+    If anything fails or interrupts the measurement, everything measured before is printed and written.
     """
     for name in settings.files:
         registered(name)

@@ -1,7 +1,7 @@
-"""The largest number of multiply-adds per second of a core, measured: a section of ``lag-envs bench``.
+"""The measured peak rate of multiply-adds of a core: a section of ``lag-envs bench``.
 
-A product costs as much as a multiply-add, so each counts as one. Sums alone are left out, since many
-processors do them in parallel.
+A product takes as long as a multiply-add, so it counts as one. Sums without a product are left out, since
+many processors do them in parallel.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
 from lag_envs.stepping.compiling import compile_lines, count_operations
 
-#: How many numbers, few enough for the nearest cache, and multiply-adds on each, so many that loads do not
-#: matter.
+#: How many numbers (few enough for the nearest cache) and how many multiply-adds on each (enough to make
+#: loads negligible).
 NUMBERS, TIMES = 1024, 12
 PRODUCTS = frozenset({"*", "a*b+c", "a*b-c", "c-a*b"})
 
@@ -53,7 +53,7 @@ def peak() -> Callable[[int], int]:
 
 
 def products(program: Program) -> int | None:
-    """Return how many products an ordinary step of one environment computes; None if it has a loop."""
+    """Return how many products an ordinary step of one environment computes; None if the step has a loop."""
     if program.general:
         return None
     lines = [*program.control, *program.fast, *program.outcome, *program.kick, *program.observe]

@@ -16,7 +16,7 @@ from lag_envs.benchmark.rounds import Run
 
 
 def cartpole(n: int) -> Run:
-    """Prepare Gymnasium's own vector environment of CartPole; its episodes soon end at different times."""
+    """Prepare Gymnasium's own vector environment of CartPole, whose episodes soon end at different times."""
     envs = gym.make_vec("CartPole-v1", num_envs=n, vectorization_mode="vector_entry_point")
     envs.reset(seed=0)
     run = batch(envs.step, [(a[:, 0] > 0.0).astype(np.int64) for a in random_actions(n)])
@@ -65,7 +65,7 @@ def gymnax(n: int, together: int = 8) -> Run:
 
 
 def torchrl(n: int) -> Run:
-    """Prepare TorchRL's pendulum; its episodes have no end."""
+    """Prepare TorchRL's pendulum, whose episodes have no end."""
     torch = import_module("torch")
     torch.set_num_threads(1)
     env = import_module("torchrl.envs").PendulumEnv()

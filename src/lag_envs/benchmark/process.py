@@ -1,4 +1,4 @@
-"""The process that measures, on its own cores."""
+"""The separate process in which the measurement runs, on its own cores."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lag_envs.workers import obey_parent, run_stoppable
 def in_own_process(settings: BenchmarkSettings) -> int:
     """Run `bench` in a separate process, on as many cores as it has threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark.process", json.dumps(asdict(settings))]
-    # What it keeps for a while goes even if it is killed.
+    # Its temporary files are removed even if it is killed.
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         return run_stoppable(command, os.environ | ONE_THREAD | {"TMPDIR": folder})
 

@@ -23,7 +23,7 @@ def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def ratios(rates: Sequence[float], others: Sequence[float]) -> list[float]:
-    """Return the ratio within each round, for rounds that both have.
+    """Return the ratio within each round, for the rounds that both lists have.
 
     Examples
     --------
@@ -50,7 +50,7 @@ def row_summary(row: Contestant, rows: Sequence[Contestant]) -> dict[str, Any]:
 
 
 def speedups(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
-    """Return, for each batch that several threads step, the quartiles of the ratio to one thread."""
+    """Return, for each batch stepped by several threads, the quartiles of the ratio to one thread."""
     rates = {(row.library, row.id, row.num_envs): row.rates for row in rows if row.kind == "vector"}
     return [
         {"id": id, "num_envs": n, "ratio": quartiles(pairs)}

@@ -21,7 +21,8 @@ CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
 class Contestant:
     """One row of the table.
 
-    ``rates`` holds the env-steps per second of each round; ``problem`` says why there are no (more) of them.
+    ``rates`` holds the env-steps per second of each round; ``problem`` says why there are no rates, or no
+    more.
     """
 
     library: str
@@ -33,8 +34,8 @@ class Contestant:
     problem: str | None = None
 
 
-#: The library's place in rows of scenes defined by energies, of environments with other keywords, of several
-#: threads, and of the core's peak.
+#: What replaces the library's name in rows of scenes defined by energies, of environments with other
+#: keywords, of several threads, and of the core's peak.
 ENERGIES, VARIED, THREADED = "lag_envs, energies", "lag_envs, varied", "lag_envs, threads"
 CORE = "this core"
 
@@ -42,7 +43,7 @@ CORE = "this core"
 def measure_rates(
     rows: Sequence[Contestant], rounds: int, seconds: float, clock: Clock = time.perf_counter
 ) -> bool:
-    """Fill in the contestants' rates; return False if the user interrupted it, keeping the rates so far."""
+    """Fill in the contestants' rates; if the user interrupts, keep the rates so far and return False."""
     runs: dict[int, tuple[Run, int]] = {}
     with progress(len(rows) * (rounds + 1)) as advance:
         try:
@@ -66,7 +67,7 @@ def measure_rates(
 
 @contextmanager
 def excused(row: Contestant) -> Iterator[None]:
-    """Record a contestant's error in its row, so that the others can continue."""
+    """Record a contestant's error in its row, so that the other contestants can continue."""
     try:
         yield
     except Exception as error:
@@ -75,7 +76,7 @@ def excused(row: Contestant) -> Iterator[None]:
 
 
 def calibrate(run: Run, seconds: float, clock: Clock) -> int:
-    """Return the number of steps that take about so long."""
+    """Return the number of steps that take about the given time."""
     run(1)  # compiles
     steps = 1
     while True:
@@ -89,7 +90,7 @@ def calibrate(run: Run, seconds: float, clock: Clock) -> int:
 
 def rate(run: Run, steps: int, clock: Clock) -> float:
     """Return steps per second."""
-    run(1)  # refills the caches after the others
+    run(1)  # refills the caches after the other contestants
     start = clock()
     taken = run(steps)
     return taken / (clock() - start)

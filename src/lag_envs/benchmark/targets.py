@@ -1,4 +1,4 @@
-"""The ratios and times that this package should reach, and whether it does."""
+"""The ratios and times that this package should reach, and whether it reaches them."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class SpeedTarget(NamedTuple):
         return row["library"] == "lag_envs" and has_own_flow(row["id"])
 
 
-#: For environments with a dedicated flow: one for each column of the table.
+#: Targets for environments with a dedicated flow, one for each column of the table.
 TARGETS = (
     SpeedTarget("made", 1, 2.0),
     SpeedTarget("vector", 64, 6.0),
     SpeedTarget("vector", 1024, 3.0),
     SpeedTarget("vector", 16384, 3.0),
 )
-#: For the general series.
+#: Targets for the general series.
 SERIES_TARGETS = (
     SpeedTarget("vector", 16384, 1.0, "CartPole, exact"),
     SpeedTarget("vector", 16384, 0.25, "Chain(2)"),
@@ -56,7 +56,7 @@ COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
 @cache
 def has_own_flow(env_id: str) -> bool:
-    """Return whether an environment is stepped by its scene's dedicated flow alone."""
+    """Return whether an environment is stepped only by its scene's dedicated flow."""
     return env_id in TASKS and not TASKS[env_id].imperfections and form_of(TASKS[env_id]().scene) is not None
 
 
