@@ -164,7 +164,7 @@ def _in_graph(run: Run, device: torch.device) -> Run:
 
 
 def _rates(runs: Sequence[Run], device: torch.device, seconds: float, rounds: int) -> list[float]:
-    """Return how often per second functions can be called: medians of interleaved samples of a given length."""
+    """Return how often per second functions can be called: medians of samples, taken in turn."""
 
     def wait() -> None:
         if device.type == "cuda":

@@ -24,7 +24,7 @@ from lag_envs.workers import stopping_point
 
 #: Length of the step [s], states in a batch, and calls in a sample of single steps.
 DT, BATCH, CALLS = 0.02, 1024, 20
-#: Number of environments in a batch of whole steps, and of the steps from which they are differentiated.
+#: Number of environments, and of consecutive whole steps that are taken and differentiated.
 ENVS, STEPS = 16384, 8
 #: Scenes of the package, each with its most expensive control.
 CASES: dict[str, Callable[[], Scene]] = {

@@ -1,4 +1,4 @@
-"""Error against run time, and stability: what ``lag-envs report`` measures, and how it is shown.
+"""Error against run time, and stability: what ``lag-envs report`` measures, and how results are shown.
 
 =====================  ====================================================================================
 `report`               the whole report: settings, jobs, files
@@ -16,5 +16,5 @@
 `diagrams`             the same points as pictures
 =====================  ====================================================================================
 
-The environments use none of this; it needs the extra ``report``.
+The environments use nothing of this package, which needs the extra ``report``.
 """

@@ -16,8 +16,8 @@ _COS = [(-1.0) ** k / math.factorial(2 * k) for k in range(10)]
 def cosine_sine(angle: Any, xp: Any) -> tuple[Any, Any]:
     """Return cosine and sine to rounding, for angles up to some 1e5 rad.
 
-    Only arithmetic, so that a compiled loop over a batch is vectorised like lag_envs's; with calls of the C
-    library the comparison integrators would be ten times slower.
+    The function uses only arithmetic, so that a compiled loop over a batch is vectorised like lag_envs's.
+    With calls of the C library, the comparison integrators would be ten times slower.
     """
     quarter = xp.floor(angle * (2.0 / math.pi) + 0.5)
     r = angle - quarter * _HALF_PI[0] - quarter * _HALF_PI[1] - quarter * _HALF_PI[2]

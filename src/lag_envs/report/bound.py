@@ -1,7 +1,7 @@
-"""The bound on a step's truncation error that is known beforehand, against the actual truncation error.
+"""The bound on a step's truncation error, known before the step, against the actual truncation error.
 
-Truncation is compared with truncation: the actual error is the sum of the exact motion's coefficients beyond
-the series' order, from the oracle. Rounding plays no part.
+Only truncation is compared, without rounding: the actual error is the sum of the exact motion's coefficients
+beyond the series' order, from the oracle.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SECTION = "bound"
 ORDERS = (8, 12, 14, 16, 20)
 DIGITS = 100
-MORE = 80  # coefficients beyond the order that are summed as the truncation error
+MORE = 80  # number of coefficients beyond the order that are summed as the truncation error
 MOST_SUBSTEPS = 100  # of the steps whose cost is measured, which run as plain Python
 TOLERANCE = pendulum.TOLERANCE
 
@@ -97,7 +97,7 @@ def truncation(
 ) -> tuple[float, float]:
     """Return the truncation errors of a step of the series in θ [rad], θ' [rad/s]; infinite if it diverges.
 
-    They are the sums of the oracle's next `MORE` coefficients beyond the order.
+    The errors are the sums of the oracle's next `MORE` coefficients beyond the order.
     """
     scene, control = driven(drive)
     state = [0.0, 0.0, theta, omega]
@@ -112,7 +112,7 @@ def truncation(
 
 
 def random_problem(rng: np.random.Generator) -> tuple[float, float, Coefficients]:
-    """Return θ, θ' and a drive, from calm to violent, each term present four times out of five."""
+    """Return θ, θ' and a drive, from calm to violent; each term is present with probability 4/5."""
     exponents = rng.uniform([-1, -1, -2, -1, -1], [3, 3, 2, 3, 4])
     sizes = 10.0**exponents * rng.uniform(-1, 1, 5) * (rng.random(5) < 0.8)
     sizes[2] = abs(sizes[2])
@@ -137,7 +137,7 @@ def majorant(x: float, h: float, order: int) -> tuple[float, float]:
 
 
 def bound_points(n: int, seed: int) -> Iterator[Row]:
-    """Yield bound and truncation error of one step, at every order, for n random drives."""
+    """Yield the bound and the truncation error of one step, at every order, for n random drives."""
     for i in range(n):
         rng = np.random.default_rng([seed, i])
         theta, omega, drive = random_problem(rng)
@@ -207,7 +207,7 @@ def environment(id: str, n: int) -> Iterator[Row]:
     angle, rng = stepped.angle, np.random.default_rng(1)
 
     def state(theta: float, speed: float) -> list[float]:
-        """Return a state whose other entries are at the edge of the task's starts."""
+        """Return a state with its other entries at the edge of the range of the task's starts."""
         entries = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
         entries[angle : angle + 2] = theta, speed
         return entries

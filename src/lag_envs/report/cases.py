@@ -24,7 +24,7 @@ class Variant(NamedTuple):
     controls: tuple[float, float]
 
     def scene(self, **changes: Any) -> Scene:
-        """Return the scene, with other parameters if asked for."""
+        """Return the scene, with other parameters if given."""
         return self.kind(**(self.parameters | changes))
 
 
@@ -68,7 +68,7 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
     name : str
         Name of the variant.
     n, seed : int
-        How many, and the seed of their sequence; a longer ensemble begins with the shorter one.
+        Number of problems, and the seed of their sequence; a longer ensemble begins with the shorter one.
     vary : bool, default True
         Multiply every parameter that is not zero by a factor between 1/2 and 2, log-uniform.
 
@@ -100,7 +100,8 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
 def scales(case: Case, dt: float) -> list[float]:
     """Return the size by which each state entry's error is divided, as docs/numerics.md defines accuracy.
 
-    For angles and lengths max(1, |q|, |q'| dt), for their rates max(1, |q'|, the field's contribution).
+    The size is max(1, |q|, |q'| dt) for angles and lengths, and max(1, |q'|, the field's contribution) for
+    their rates.
     """
     from lag_envs.report.flow_equations import EQUATIONS
     from lag_envs.report.stepped import Stepped

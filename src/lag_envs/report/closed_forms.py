@@ -1,7 +1,7 @@
 """Closed forms of motions: elliptic functions for the undamped pendulum, and linear motion.
 
-They check the oracle, and replace it where a pendulum turns so far that the oracle, with a step per radian,
-would take minutes.
+The closed forms check the oracle. They replace it if a pendulum turns so far that the oracle, which takes a
+step per radian, would need minutes.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def elliptic(alpha: mpf, beta: mpf, theta: mpf, rate: mpf, dt: mpf) -> tuple[mpf
 
 
 def pendulum(oracle: Oracle, controls: Sequence[Any]) -> tuple[sympy.Rational, sympy.Rational] | None:
-    """Return (alpha, beta) where the one free coordinate moves as in `elliptic`, or None."""
+    """Return (alpha, beta) if the only free coordinate moves as in `elliptic`, else None."""
     names, equations = oracle.names, oracle.equations
     if len(names.free) != 1 or any(kind == "momentum" for _, kind in names.state):
         return None

@@ -59,7 +59,7 @@ FREE = {
     "incline": FreeMotion(Incline(tilt=math.pi / 12), (0.0, 1.0)),
 }
 QUICK = ("bar, 2 rad", "bar, turning over")
-#: Seconds over which positions are compared; each is a whole number of steps.
+#: Times [s] over which positions are compared; each is a whole number of steps.
 STEPS, QUICK_STEPS = 10**7, 10**5
 
 
@@ -101,8 +101,8 @@ def marks(steps: int) -> NDArray[np.int64]:
 def compile_march(scene: Stepped) -> Callable:
     """Compile ``march(out, marks, dt, x, constants...)`` for a scene without control.
 
-    Row j of `out` is the lifted state after ``marks[j]`` steps, row -1 the start; it returns the number of
-    filled rows.
+    Row j of `out` is the lifted state after ``marks[j]`` steps, and row -1 the start. The function returns
+    the number of filled rows.
     """
     code = scene.stepper()
     width = len(code.start)
@@ -136,7 +136,7 @@ def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArr
 
 
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
-    """Yield the drifts of a run without drag and drive; for lag_envs also error and amplified rounding."""
+    """Yield the drifts of a run without drag and drive; for lag_envs also its error and amplified rounding."""
     problem = FREE[name]
     scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
@@ -213,7 +213,7 @@ def energy_imbalance(variant: str, steps: int) -> Iterator[Row]:
 
 
 def exponent(steps: Sequence[float], values: Sequence[float | None]) -> float | None:
-    """Return the exponent of growth over the last two decades, of the largest value so far.
+    """Return the exponent with which the largest value so far grows over the last two decades.
 
     Examples
     --------
@@ -229,7 +229,7 @@ def exponent(steps: Sequence[float], values: Sequence[float | None]) -> float | 
 
 
 def worst(values: Sequence[float | None]) -> float | None:
-    """Return the largest size, or None if one is not finite."""
+    """Return the largest size, or None if a value is not finite."""
     return None if None in values or not values else max(abs(v) for v in values if v is not None)
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; numbers stay numbers, so that the CSV file has all their digits."""
+    """A table in which numbers remain numbers, so that the CSV file has all their digits."""
 
     name: str  #: of the CSV file, and the anchor
     caption: str
@@ -23,9 +23,9 @@ class Table:
     def of(
         cls, name: str, caption: str, columns: Mapping[str, str | Callable[[Any], Any]], found: Iterable[Any]
     ) -> Table:
-        """Return a table with a line for each thing found.
+        """Return a table with a line for each item of `found`.
 
-        A column shows an entry of it, or what a function returns for it.
+        A column shows an entry of the item, or what a function returns for the item.
 
         Examples
         --------
@@ -39,14 +39,14 @@ class Table:
         return cls(name, caption, list(columns), cells)
 
     def part(self, name: str, caption: str, columns: Sequence[str]) -> Table:
-        """Return a table of some of its columns."""
+        """Return a table with some of the columns."""
         places = [list(self.columns).index(column) for column in columns]
         return Table(name, caption, columns, [[row[i] for i in places] for row in self.rows])
 
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure, drawn when it is written."""
+    """A figure, which is drawn when its file is written."""
 
     name: str  #: of the file
     caption: str  #: the content, the cases, and the reference
@@ -56,7 +56,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class Claim:
-    """A measured statement; `holds` is None if there was nothing to measure it by."""
+    """A measured statement; `holds` is None if nothing was measured that could decide it."""
 
     text: str
     holds: bool | None

@@ -42,7 +42,7 @@ LOWEST = 1e-17
 
 
 def draw_variant(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapping[tuple, float]) -> Figure:
-    """Draw one variant: horizons side by side, alone above, a batch below."""
+    """Draw one variant: horizons side by side, single states above, batches below."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.5, 7.6), layout="constrained")
@@ -93,7 +93,7 @@ def panel(ax: Axes, points: Sequence[WorkPrecisionPoint], floor: float | None) -
 
 
 def curves(points: Sequence[WorkPrecisionPoint]) -> dict[str, list[WorkPrecisionPoint]]:
-    """Return a curve for each rival: of all forms of a method, the points that no other form beats."""
+    """Return a curve for each rival: the points, from all forms of a method, that no other form beats."""
     found: dict[str, list[WorkPrecisionPoint]] = {}
     for p in points:
         if not p.own:

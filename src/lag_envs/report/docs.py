@@ -40,7 +40,7 @@ OVERVIEW = ReportFigure(
 
 
 class PagePart(NamedTuple):
-    """A part of the page to read: a section of the report, with words that hold for any measurement."""
+    """A section of the report as a part of docs/accuracy.md, with words that hold for any measurement."""
 
     section: str
     title: str
@@ -156,7 +156,7 @@ def update(project: Path) -> None:
 
 
 def generated(project: Path) -> dict[Path, str]:
-    """Return the generated files as they should be."""
+    """Return what the generated files should contain."""
     docs = project / "docs"
     accuracy, speed, other, on_gpu = (
         json.loads((docs / name).read_text(encoding="utf-8"))
@@ -179,7 +179,7 @@ def drawn_figure(picture: ReportFigure, folder: Path) -> Path:
 
 
 def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
-    """Return the parts of a report that the texts need."""
+    """Return the parts of a report that the pages need."""
     sections = []
     for name, content in content_of(found).items():
         sections.append(
@@ -205,7 +205,7 @@ def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
 
 
 def accuracy_markdown(accuracy: dict[str, Any]) -> str:
-    """Return docs/accuracy.md, the page to read."""
+    """Return docs/accuracy.md, the page to read first."""
     sections = {section["name"]: section for section in accuracy["sections"]}
     claims = [claim for section in accuracy["sections"] for claim in section["claims"]]
     broken = [claim for claim in claims if claim["holds"] is False]

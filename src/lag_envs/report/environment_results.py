@@ -24,9 +24,9 @@ LARGEST_STEP, LARGEST_ERROR, ROUNDINGS = 1e-15, 1e-13, 100.0
 #: The accuracy that any scene promises of a step. The certificate requires less truncation error, but
 #: measures a velocity by energy, and a light body's velocity may be small compared to that measure.
 PROMISED = 1e-12
-APART = 1e9  #: Gymnasium's errors should be larger than those of lag_envs by at least this factor
-#: The undriven pendulum is released at rest, this far from hanging [rad]; it is compared over the first time,
-#: its energy over the second [s].
+APART = 1e9  #: Factor by which Gymnasium's errors should at least exceed those of lag_envs.
+#: The undriven pendulum is released at rest, this far from hanging [rad]. Its angle is compared over the
+#: first time, its energy over the second time [s].
 RELEASED, COMPARED, LONG = 2.5, 10.0, 100.0
 MARKS = ("one step", *(f"{t:g} s" for t in TIMES), "the end")
 BLUE, GREY = "#0072b2", "#666666"
@@ -304,7 +304,7 @@ def _colour(row: Row) -> str:
 
 
 def _curve(row: Row) -> tuple[list[float], list[float], list[float]]:
-    """Return times, errors and amplified roundings; exact zeros are drawn at the picture's lower end."""
+    """Return times, errors and amplified roundings; exact zeros are drawn at the lower end of the picture."""
     times, errors, amplified = zip(*row["curve"], strict=True)
     return list(times), [max(e, 1e-19) for e in errors], list(amplified)
 

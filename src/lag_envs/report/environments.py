@@ -1,7 +1,7 @@
-"""The error of whole episodes: every environment of lag_envs, and those of the same kind in Gymnasium.
+"""The error of whole episodes, in every environment of lag_envs and its counterparts in Gymnasium.
 
 An episode is recorded as it comes out of ``gym.make``: its float64 states, and the controls that were
-applied. `episodes` compares it with the exact one, `gymnasium_peers` has Gymnasium's equations, and
+applied. `episodes` compares it with the exact episode, `gymnasium_peers` has Gymnasium's equations, and
 `environment_results` presents the errors.
 """
 
@@ -37,7 +37,7 @@ from lag_envs.tasks.pivoted_bar import SwingUpFree
 __all__ = ["content", "jobs", "own_episode", "peer_episode", "undriven"]
 
 SECTION = "environments"
-#: Longest episode in control steps: each is followed several times to more than 30 digits.
+#: Longest episode in control steps, as each is followed several times to more than 30 digits.
 MOST_STEPS = 1_000
 
 
@@ -72,7 +72,7 @@ def jobs(quick: bool) -> list[ReportJob]:
 
 
 def longest(task: Task) -> float | None:
-    """Return how long an episode is followed [s], or None for the whole of it."""
+    """Return how long an episode is followed [s], or None for the whole episode."""
     return MOST_STEPS * task.dt if task.limit > MOST_STEPS else None
 
 
@@ -80,7 +80,7 @@ def longest(task: Task) -> float | None:
 
 
 def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
-    """Yield one row: an episode of our environment against the exact one."""
+    """Yield one row: an episode of our environment against the exact episode."""
     options: dict[str, Any] = {} if duration is None else {"duration": duration}
     env = gym.make(id, disable_env_checker=True, **options)
     env.reset(seed=seed)
@@ -90,7 +90,7 @@ def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[R
 
 
 def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool = False) -> Row:
-    """Return the row of an episode of lag_envs; if asked, computed twice, with the difference of the two."""
+    """Return the row of an episode of lag_envs; if requested, computed twice, with the difference."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
         return exact_states(task, seed, start, episode.controls, digits)
@@ -114,8 +114,8 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
 def peer_episode(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
     """Yield rows of one of Gymnasium's environments under random actions.
 
-    CartPole-v1 falls within half a second; a second row continues to 10 s, by its own update, as if it had
-    not ended.
+    CartPole-v1 falls within half a second. A second row continues to 10 s, by the environment's own update,
+    as if the episode had not ended.
     """
     seconds = seconds or {"Acrobot-v1": 100.0}.get(id, 10.0)
     steps = round(seconds / PEERS[id].step(gym.make(id, disable_env_checker=True).unwrapped))
@@ -129,7 +129,7 @@ def peer_episode(id: str, seed: int, seconds: float | None = None) -> Iterator[R
 
 # --- the undriven pendulum ---
 
-#: Peers, a change that removes their force, and the action for it.
+#: Peers, a change that removes their force, and the action to take.
 UNDRIVEN: dict[str, tuple[dict[str, float], Any]] = {
     "Pendulum-v1": ({}, np.zeros(1, np.float32)),
     "CartPole-v1": ({"force_mag": 0.0}, 0),

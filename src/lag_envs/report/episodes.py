@@ -1,8 +1,8 @@
-"""Recorded episodes, and their errors against exact ones.
+"""Recorded episodes, and their errors against exact episodes.
 
-From the same start, under the same controls, the exact states are computed to more than 30 digits by chaining
-control steps without rounding the states in between. For the error of one step, every step of the episode is
-repeated by itself, from the recorded state.
+The exact states, from the same start and under the same controls, are computed to more than 30 digits by
+chaining control steps without rounding the states in between. For the error of one step, every step of the
+episode is repeated separately, from the recorded state.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def endless_actions(env: gym.Env, seed: int) -> Iterator[Any]:
 def exact_stepping(task: Task, seed: int, digits: int) -> ExactStep:
     """Return the exact step of our environment.
 
-    Kicks are those of the first episode after a reset with that seed, from the task's own formula and the
-    environment's own random numbers, which are a function of seed, episode and step. They are multiples of
-    2**-52, so they are exact.
+    Kicks are those of the first episode after a reset with that seed. They follow from the task's formula and
+    the environment's random numbers, which are a function of seed, episode and step. The random numbers are
+    multiples of 2**-52, so they are exact.
     """
     k = SimpleNamespace(**task.formulas.constants())
     choose = SimpleNamespace(where=lambda c, a, b: a if c else b)
@@ -73,7 +73,7 @@ def exact_stepping(task: Task, seed: int, digits: int) -> ExactStep:
     key = np.uint64(episode_key(np.uint64(seed), np.uint64(1)))  # a plain integer would be taken as signed
 
     def step(state: Sequence[Any], number: int, control: float) -> list[mpf]:
-        # One computation; whole episodes are checked by a second one with more digits.
+        # One computation; whole episodes are checked by a second computation with more digits.
         state = oracle.once(state, control, task.dt, digits)
         with mp.workdps(digits + 30):
             draws = [float(uniform(key, np.uint64(number), np.uint64(i))) for i in range(task.draws)]
@@ -122,15 +122,15 @@ def episode_errors(
 ) -> Row:
     """Return errors and amplified rounding, each the largest up to a time.
 
-    Those of the "entries" are in their units, all others relative to the states' sizes. "one step" is the
-    largest error of any single step of the episode.
+    Errors of the "entries" are in their units, all others are relative to the states' sizes. "one step" is
+    the largest error of any single step of the episode.
 
     Parameters
     ----------
     episode : RecordedEpisode
         The recorded episode.
     step : callable
-        Repeats every step by itself, from the recorded state.
+        Repeats every step separately, from the recorded state.
     path, shifted : list of list of mpf
         The exact states from the same start, and from the start moved by a rounding.
     dt : float

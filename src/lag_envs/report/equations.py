@@ -1,8 +1,8 @@
 """Problems in the form that every rival takes: y' = rate(t, y, p) on generic numbers; arrays of starts.
 
-`Problems` makes them of a scene's cases by the scene's own flow and coefficients, so that all solve the same
-equation. Any other equation will do as well: a rival needs an `Equation`, the arrays, and a way back from its
-unknowns to states.
+`Problems` makes them from a scene's cases by the scene's own flow and coefficients, so that all rivals solve
+the same equation. Any other equation can be used as well: a rival needs an `Equation`, the arrays, and a
+function that converts its unknowns back to states.
 
 Examples
 --------
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 
 class Equation(ABC):
-    """A system of first order; equal ones share compiled code, so they are hashable."""
+    """A system of first order; equal systems share compiled code, so they are hashable."""
 
     size: int  #: number of unknowns
     lifted: int  #: the same, with cosines and sines as additional unknowns
@@ -46,7 +46,8 @@ class Equation(ABC):
     def stepper(self, method: str, carried: bool) -> Callable:
         """Return ``step(y, p, t, h, xp)`` of one of `METHODS`.
 
-        It takes and returns lifted unknowns; if they are not carried, cosines and sines are left as they are.
+        The step takes and returns lifted unknowns; if cosines and sines are not carried, they are left
+        unchanged.
 
         Raises
         ------
@@ -93,7 +94,7 @@ class NormalFormEquation(Equation):
         return sum(self.present) + EQUATIONS[self.kind].turns
 
     def coefficients(self, p: Sequence) -> Any:
-        """Return the flow's coefficients; the missing ones are a literal 0.0."""
+        """Return the flow's coefficients; missing coefficients are a literal 0.0."""
         given = iter(p)
         return self.kind(*(next(given) if there else 0.0 for there in self.present))
 

@@ -18,15 +18,15 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 
-#: The accuracy that docs/accuracy.md promises, relative to the scales; and how many roundings of the state
-#: are allowed in addition.
+#: The accuracy that docs/accuracy.md promises, relative to the scales, and the number of roundings of the
+#: state that are allowed in addition.
 EXACT, ROUNDINGS = 1e-12, 10.0
 
 FULL, AMPLIFIED, REFUSED = "full accuracy", "amplified rounding", "refused with an error"
 
 
 class Extreme(NamedTuple):
-    """A demanding step; the scene is made when it is measured, since making it may already be refused."""
+    """A demanding step; its scene is made only when measured, since making it may already be refused."""
 
     scene: str
     parameters: dict[str, Any]
@@ -136,12 +136,12 @@ QUICK = (
 
 
 def amplification(case: Case, dt: float) -> list[float]:
-    """Return by how much one rounding of the start is amplified at the step's end, whatever the method.
+    """Return how much a step amplifies one rounding of its start, whatever the method.
 
     Every entry of the state is moved up and down by 2**-53 times its size; for angles the size is at least
     1 rad, since cosine and sine are stored to absolute precision, for a pendulum's rate at least
-    (α² + β²)^¼. The moves are of finite size: next to the unstable equilibrium they show what a rounding
-    really does, where a derivative would give too much or too little.
+    (α² + β²)^¼. The moves are of finite size, so that they show what a rounding really does next to the
+    unstable equilibrium, where a derivative would give too much or too little.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def substeps(case: Case, dt: float) -> int:
 
 
 def built_case(extreme: Extreme) -> Case:
-    """Return the case; raises the scene's own errors."""
+    """Return the case; the scene's own errors are raised."""
     scene: Scene = getattr(scenes, extreme.scene)(**extreme.parameters)
     return Case(scene, tuple(map(float, extreme.state)), extreme.control)
 
@@ -196,9 +196,9 @@ def built_case(extreme: Extreme) -> Case:
 def measure_extreme(name: str) -> Row:
     """Take a case's step and return a row with its outcome.
 
-    ``error`` is the largest error of an entry relative to its scale, ``amplification`` the largest effect of
-    a rounding relative to the same, ``roundings`` the largest error of an entry over the effect of one
-    rounding of the start, or of the end itself. All are None if the step was refused.
+    ``error`` is the largest error of an entry relative to its scale; ``amplification`` is the largest effect
+    of a rounding relative to that scale; ``roundings`` is the largest error of an entry over the effect of
+    one rounding of the start, or of the end itself. All three are None if the step was refused.
     """
     extreme = EXTREMES[name]
     row: Row = {"name": name, "scene": extreme.scene, "expected": extreme.expected, "dt": extreme.dt}

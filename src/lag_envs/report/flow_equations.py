@@ -1,7 +1,7 @@
 """The equations of motion that the fast flows solve, as the comparison integrators need them.
 
-Each flow has a class, and `EQUATIONS` finds it by the type of the flow's coefficients. Nothing else in the
-report asks which flow it is.
+Each flow has a class, and `EQUATIONS` maps the type of the flow's coefficients to it. No other part of the
+report depends on which flow it is.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Problem(NamedTuple):
 
 
 class FlowEquation(ABC):
-    """A flow's equation. Its methods take the flow's coefficients `k`, which hold at t = 0."""
+    """A flow's equation, whose methods take the flow's coefficients `k` at t = 0."""
 
     flow: Flow
     lifted = 4  #: number of the flow's variables: q, v, and cosine and sine where it has them

@@ -23,8 +23,8 @@ class OperationList:
 
     def __init__(self, expressions: Sequence[Any], inputs: Sequence[Any], held: Sequence[Any]) -> None:
         self.constants: list[Any] = []
-        #: Operations with the indices of their arguments; each appends one value, or two, to those of the
-        #: inputs.
+        #: Operations with the indices of their arguments; each appends one or two values to the inputs'
+        #: values.
         self.program: list[tuple[str, tuple[int, ...]]] = []
         self._place: dict[Any, int] = {x: i for i, x in enumerate((*inputs, *held))}
         self._inputs, self.size = set(self._place), len(self._place)
@@ -124,7 +124,7 @@ class OperationList:
 
 
 def reduced(expression: Any) -> Any:
-    """Return an expression multiplied out, squares of sines by those of cosines."""
+    """Return an expression multiplied out, with squares of sines replaced by squares of cosines."""
     sine = sympy.Wild("sine"), sympy.Wild("n", properties=[lambda n: n.is_Integer and n > 1])
     square = sympy.sin(sine[0]) ** sine[1]
 
@@ -142,7 +142,8 @@ class FormulaSeries:
     formulas : OperationList
         The expressions to compute.
     given : sequence of list of flint.arb
-        Coefficients of the inputs, which the caller extends; the held ones, at the end, have one.
+        Coefficients of the inputs, which the caller extends; held inputs, at the end, have one coefficient
+        each.
     constants : sequence of flint.arb
         The formulas' constants.
     """
@@ -156,7 +157,7 @@ class FormulaSeries:
         self.found = [self._y[i] for i in formulas.found]
 
     def extend(self) -> None:
-        """Compute one more coefficient of all series, when the inputs have one more."""
+        """Compute one more coefficient of all series, once the inputs have one more."""
         y, c, held = self._y, self._constants, self._formulas.held
         out, k = self._first, len(y[0]) - 1
         for operation, at in self._formulas.program:

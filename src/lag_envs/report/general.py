@@ -1,8 +1,8 @@
 """Scenes defined by energies alone: error against time compared with other engines, certificates, energy.
 
 Each system takes one control step from the same harsh states, with every joint turning fast at once. All
-rivals run in compiled loops, many states in one call, and the errors are those of the timed calls. Other
-engines' models are first checked to be the same.
+rivals run in compiled loops, with many states in one call, and the errors are those of the timed calls. Other
+engines' models are first checked to be equal.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ __all__ = ["attempts_and_bounds", "content", "jobs", "shares", "timed_rivals", "
 SECTION = "general"
 #: Copies of the states in a timed call.
 COPIES = 8
-#: Tolerances of heyoka and ours. They are closest where an error to be compared at is just reached.
+#: Tolerances of heyoka and lag_envs. They lie closest together where an error used for comparison is just
+#: reached.
 TOLERANCES: Sequence[float] = (
     1e-1, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-6, 5e-7, 3e-7, 1e-7, 1e-8, 1e-9, 3e-10, 1e-10, 1e-11, 1e-12,
     3e-13, 1e-13, 1e-14,
@@ -57,11 +58,11 @@ RADAU: Sequence[int] = (1, 2, 4, 8, 16, 32, 64)
 #: Step lengths at which the certificate is tried [s].
 LENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1)
 FAMILIES = ("compiled", "heyoka", *ENGINES)
-#: Timed in turn with every job's samples.
+#: The sample that is timed in turn with every job's samples.
 CLOCK = CertifiedSeries(16, 1e-12)
 #: Seconds over which energy is recorded.
 LONG = 1000.0
-#: Prints the seconds that a scene takes to its first step.
+#: Prints the time that a scene takes until its first step [s].
 FIRST = """
 from math import inf
 from time import process_time
@@ -128,7 +129,7 @@ def jobs(quick: bool) -> list[ReportJob]:
 
 
 def exact_ends_of_systems(name: str, count: int) -> Iterator[Row]:
-    """Compute the exact end states, which are kept for the other jobs."""
+    """Compute the exact end states and keep them for the other jobs."""
     system = SYSTEMS[name]
     high, _ = exact_ends(system.scene, *system.draw(count), DT)
     yield {"kind": "exact", "system": name, "states": len(high)}
@@ -249,7 +250,7 @@ def again(sample: Sample) -> Sample:
 
 
 def certificate(name: str, count: int) -> Iterator[Row]:
-    """Yield how many steps from harsh states are certified as a whole, and the attempts of the others."""
+    """Yield how many steps from harsh states are certified as a whole, and how many attempts others need."""
     system = SYSTEMS[name]
     for dt in LENGTHS:
         for order in CERTIFIED_ORDERS:
@@ -260,7 +261,7 @@ def certificate(name: str, count: int) -> Iterator[Row]:
 def attempts_and_bounds(
     scene: Any, states: Array, controls: Array, dt: float, order: int
 ) -> tuple[list[int], Array]:
-    """Return each step's attempts, not positive if it was refused, and the largest bound of any step."""
+    """Return each step's attempts (not positive if refused), and the largest bound of any step."""
     code, numbers = series_code_of(scene)
     attempts, bounds = [], []
     for state, held in zip(states.tolist(), controls.tolist(), strict=True):
@@ -281,7 +282,7 @@ def shares(attempts: Sequence[int]) -> Row:
 
 
 def first_step_seconds(name: str, rounds: int) -> Iterator[Row]:
-    """Yield the seconds until the first step: with an empty and a filled cache, and heyoka's."""
+    """Yield the seconds until the first step, with an empty and with a filled cache, and those of heyoka."""
     system = SYSTEMS[name]
     state, control = (x[0].tolist() for x in system.draw(1))
     script = FIRST.format(scene=system.scene, state=state, control=control, dt=DT)
@@ -308,7 +309,7 @@ def _heyoka(system: System, mode: str) -> float:
     problems = SceneProblems(system.scene, *system.draw(1), system)
     width = 1 if mode == "single" else 2 * heyoka.recommended_simd_size()
     state: Any = heyoka.llvm_state
-    # Earlier compilations, today's or older, must not count; version 7 keeps them on disk too.
+    # Earlier compilations, also those of other processes, must not count; version 7 keeps them on disk too.
     state.clear_memcache()
     switch = getattr(state, "set_diskcache_enabled", lambda on: None)
     switch(False)
@@ -323,7 +324,7 @@ def _heyoka(system: System, mode: str) -> float:
 def energy(quick: bool) -> Iterator[Row]:
     """Yield how far the energy of undamped double pendulums drifts, relative to its range.
 
-    lag_envs over the whole path, the others at the end.
+    For lag_envs the drift is taken over the whole path, for the others at the end.
     """
     scene = SYSTEMS["double pendulum, driven"].scene
     count, steps = (1, 500) if quick else (4, round(LONG / DT))

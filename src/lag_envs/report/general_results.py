@@ -31,7 +31,7 @@ EQUAL, DRIFT = 1e-12, 1e-9
 
 
 class BestSetting(NamedTuple):
-    """A method's quickest setting that reaches an error."""
+    """A method's fastest setting that reaches an error."""
 
     ns: float
     label: str
@@ -45,7 +45,7 @@ def setting_label(row: Row) -> str:
 
 
 def column_name(row: Row) -> str:
-    """Return a point's column: compiled methods have one each."""
+    """Return a point's column; each compiled method has one."""
     if row["family"] == "lag_envs":
         return "lag_envs"
     if row["family"] == "compiled":
@@ -363,7 +363,7 @@ STYLES = {
 
 
 def draw_times(name: str, rows: Sequence[Row]) -> Figure:
-    """Draw worst errors against times: of each column the settings that none of its others beats."""
+    """Draw worst errors against times; of each column, the settings that no other setting beats."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""Gymnasium's counterparts of this package's environments: scenes with their equations, and episodes.
+"""Gymnasium's counterparts of this package's environments: scenes with the same equations, and episodes.
 
 A test checks on Gymnasium's own steps that the scenes have the equations of its source.
 """
@@ -82,7 +82,7 @@ PEERS = {
 def record_peer(
     env: Any, peer: GymnasiumPeer, actions: Iterator[Any], steps: int, to_the_end: bool
 ) -> RecordedEpisode:
-    """Record at most this many steps of a peer that has been reset; until its termination, or past it."""
+    """Record at most `steps` steps of a peer that has been reset, until its termination or past it."""
     states, controls, terminated = [np.array(env.state, np.float64)], [], False
     for action in itertools.islice(actions, steps):
         controls.append(peer.control(env, action))
@@ -95,7 +95,7 @@ def record_peer(
 
 
 def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, RecordedEpisode, int]:
-    """Return a peer, an episode of it, and its seed: a later one if a speed was clipped with that seed."""
+    """Return a peer, one of its episodes, and the seed: a later seed if a speed was clipped."""
     peer = PEERS[id]
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     while True:

@@ -1,8 +1,8 @@
 """The integrators that people would otherwise use, as flows that can step any scene.
 
-Each is written once, on generic numbers, for q'' = a(q, v, t), and compiled by the same machinery as
-lag_envs's flows, so that times compare methods and not compilers. A comparison integrator takes one step per
-control step; `n` substeps are `n` control steps that are n times shorter.
+Each integrator is written once, on generic numbers, for q'' = a(q, v, t). It is compiled by the same
+machinery as lag_envs's flows, so that times compare methods and not compilers. A comparison integrator takes
+one step per control step; `n` substeps are `n` control steps that are n times shorter.
 
 Cosine and sine are either computed at every stage or *carried*: an explicit Runge-Kutta method has them as
 two more unknowns, c' = -s q' and s' = c q', and calls no function at all; other methods rotate the step's
@@ -240,7 +240,7 @@ def _lifted(
 
 @cache
 def plain_series(order: int) -> Flow:
-    """Return one Taylor series per step, of a fixed order, certified or not."""
+    """Return a flow of one Taylor series per step, of a fixed order, certified or not."""
     flow = pendulum_flow(order)
     return _always(flow, flow.fast, order)
 

@@ -1,4 +1,4 @@
-"""The state and terms that each environment carries, the ones it leaves out, and the time this saves."""
+"""The state and terms that each environment carries, those that it leaves out, and the time saved."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BATCH = 1024
 
 
 class ScenePair(NamedTuple):
-    """A scene without a feature and with it, and a control step of both from the same state."""
+    """A scene with and without a feature, and a control step of both from the same state."""
 
     left_out: str
     without: Scene | Stepped
@@ -101,7 +101,7 @@ def terms() -> Iterator[Row]:
 
 
 def carried_numbers(task: Task) -> Row:
-    """Return state, terms, stages and constants of a task's compiled step, and those that nothing uses."""
+    """Return state, terms, stages and constants of a task's compiled step, and which of them are unused."""
     scene = task.scene
     numbers = task.formulas.constants()
     absent = absent_from(numbers)
@@ -143,7 +143,7 @@ def assigned(line: str) -> list[str]:
 def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
     """Return the names on which the results depend, in straight-line code.
 
-    Within a recorded block every input is used by construction, so only the calls need checking.
+    Within a recorded block every input is used by construction, so only the calls have to be checked.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
 
 
 def savings(count: int, rounds: int) -> Iterator[Row]:
-    """Yield operations and times of a step without something and with it, in a batch, timed in turn."""
+    """Yield operations and times of a step with and without a feature, in a batch, timed in turn."""
     samples = []
     for pair in PAIRS[:count]:
         for stepped in pair.stepped():

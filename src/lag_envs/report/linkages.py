@@ -1,4 +1,4 @@
-"""The general engine's scenes in the form that other engines take: links, one hanging on the other.
+"""The general engine's scenes in the form that other engines take: links, each hanging from another.
 
 `MuJoCo` and `Pinocchio` take the same table of links. A moving support is a field in its own frame, and
 hinges measure angles from link to link, so each system defines how its coordinates map to joints.
@@ -29,7 +29,7 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
 
 Array = NDArray[np.float64]
-#: Inertia about a rod's own axis where it has none: MuJoCo requires a positive one [kg m²].
+#: Inertia about the own axis of a rod without one, since MuJoCo requires a positive value [kg m²].
 THIN = 1e-15
 
 
@@ -84,7 +84,7 @@ class System:
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
         """Return harsh random states and controls, one row each; prescribed coordinates start at 0.
 
-        All joints turn at once, each at up to its full speed.
+        All joints turn at once, each with up to its full speed.
         """
         rng = np.random.default_rng(seed)
         states = np.zeros((count, len(self.scene.state_names)))
@@ -108,7 +108,7 @@ def _bars(
 ) -> list:
     """Return bars that hang one from the other and turn counter-clockwise in the plane.
 
-    x points to the left here, so that their axis is a coordinate axis, with which Pinocchio is faster.
+    Here x points to the left, so that the hinges' axis is a coordinate axis, which is faster in Pinocchio.
     """
     places = [0.0, *lengths[:-1]]
     return [
@@ -179,7 +179,7 @@ def _given(problems: Problems) -> tuple[System, Array, Array, Array]:
 
 
 def _ends(problems: Problems, system: System, joints: Array, span: float) -> Array:
-    """Return the states for joints' places and velocities, one row each, after a time."""
+    """Return the states for joints' places and velocities after a time, one row each."""
     return problems.states(np.concatenate([system.back(half) for half in np.split(joints.T, 2)]), span)
 
 
@@ -264,7 +264,8 @@ def mujoco_motion(system: System, q: Array, v: Array, control: float) -> tuple[A
 class PinocchioLinks(Engine):
     """Pinocchio's articulated-body algorithm in a compiled loop of RK4 steps.
 
-    Its wheel includes its headers: `pinocchio.cpp` is compiled once per report, if there is a compiler.
+    Pinocchio's wheel includes its headers, so `pinocchio.cpp` is compiled once per report, if a compiler
+    exists.
     """
 
     family = "pinocchio"
@@ -370,7 +371,7 @@ ENGINES: dict[str, type[Engine]] = {engine.family: engine for engine in (MuJoCoL
 def differences(system: System, family: str) -> tuple[float, float]:
     """Return the difference of an engine's mass matrices and accelerations from SymPy's at random states.
 
-    Both are relative to the largest value.
+    Both differences are relative to the largest value.
     """
     from lag_envs.report.oracle import oracle_of
 

@@ -55,7 +55,7 @@ class SceneEquation(Equation):
 
     @property
     def lifted(self) -> int:  # type: ignore[override]
-        """The same: cosines and sines are not carried."""
+        """The same number, as cosines and sines are not carried."""
         return self.size
 
     @cached_property
@@ -140,7 +140,7 @@ class SceneProblems(Problems):
         return v | {n: v[n] + sign * x for n, x in zip(layout_of(self.scene).free, shift, strict=True)}
 
     def states(self, y: Array, span: float) -> Array:
-        """Return the scene's states, one per line, from unknowns after a time with the controls held."""
+        """Return the scene's states, one per line, from the unknowns after a time with held controls."""
         layout = layout_of(self.scene)
         n = len(layout.free)
         q = self._q | dict(zip(layout.free, y[:n], strict=True))
@@ -157,8 +157,8 @@ class SceneProblems(Problems):
 class CertifiedSeries(Rival):
     """The general engine at an order and a tolerance, each step certified, in its shipped loops.
 
-    The setting is the tolerance. Alone it runs the loop of `Scene.simulate`, in a batch the block function of
-    the vector environments, both over one control step from each state.
+    The setting is the tolerance. Single states run in the loop of `Scene.simulate`, batches in the block
+    function of the vector environments; both take one control step from each state.
     """
 
     family = "lag_envs"
@@ -223,7 +223,7 @@ def _batch(code: Any, tolerance: float) -> Callable:
     """
     names = [*code.start, *code.controls]
     rows = {name: i for i, name in enumerate([*names, *code.rows])}
-    # An input of the series may have the name of a control or its own row.
+    # An input of the series may have the name of a control, or may have its own row.
     flow = {name: len(names) + i for i, name in enumerate(code.rows)}
 
     def at(row: int) -> str:

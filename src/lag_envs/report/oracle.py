@@ -1,6 +1,6 @@
 """The oracle: the exact motion of any scene, from Lagrange's equations derived by SymPy.
 
-It uses nothing of the package but the scene's energies, its names and their form in SymPy
+Of the package it uses only the scene's energies, its names and their form in SymPy
 (`lag_envs.scenes.symbolic`). Equations, series, arithmetic and step control share nothing with `mechanics`
 and `stepping`; numbers are python-flint's balls. There are two methods:
 
@@ -39,26 +39,27 @@ from lag_envs.scenes.base import Scene
 Array = NDArray[np.float64]
 #: Largest number of series for one motion; beyond it, the motion counts as unresolved.
 MOST_STEPS = 5_000
-#: How often digits are doubled.
+#: How many times digits are doubled.
 DOUBLINGS = 2
 #: Collocation is tried if damping times the time that is left exceeds this.
 STIFF = 300.0
-#: Series before the first try, and half as many again before each next one; the layer takes about as many.
+#: Number of series before collocation is first tried, about as many as the boundary layer takes; before each
+#: further try half as many again.
 FIRST_TRY = 16
-#: Extra bits against rounding within a step, tried in turn.
+#: Numbers of extra bits against rounding within a step, tried in turn.
 SPARE = (80, 240, 720)
 
 
 class Unresolved(ArithmeticError):
-    """The oracle cannot guarantee its result: the motion is singular on the way, or nearly so."""
+    """Raised if the oracle cannot guarantee its result because the motion is singular or nearly singular."""
 
 
 class Singular(Unresolved):
-    """The steps are so short, or so many, that more digits would not help."""
+    """Raised if the steps are so short, or so many, that more digits would not help."""
 
 
 class Rounded(Unresolved):
-    """Rounding within a step exceeds its allowed truncation error: the arithmetic has too few bits."""
+    """Raised if rounding within a step exceeds the allowed truncation error: there are too few bits."""
 
 
 # --- equations ----------------------------------------------------------------------------------------------
@@ -268,7 +269,7 @@ class Oracle:
     scene : Scene
         Its parameters are taken as exact numbers.
     numbers : mapping, optional
-        Other numbers for some of them, also taken as exact.
+        Other numbers for some parameters, also taken as exact.
 
     Examples
     --------
@@ -373,17 +374,18 @@ class Oracle:
         dt : float or mpf
             The time [s], which may be much longer than a control step.
         digits : int, default 30
-            Decimal digits asked for.
+            Number of requested decimal digits.
 
         Returns
         -------
         list of mpf
-            Entries on which two computations agree to 10**-digits times max(1, abs(entry)).
+            The entries; two computations of them agree to 10**-digits times max(1, abs(entry)).
 
         Raises
         ------
         Unresolved
-            If they do not, even with four times the digits, or if the motion needs too many steps.
+            If the computations do not agree even with four times the digits, or if the motion needs too many
+            steps.
         ValueError
             If the state or the controls do not have the scene's length.
         """
@@ -477,7 +479,7 @@ class Oracle:
     def _coefficients(
         self, plan: Precision, q: dict, v: dict, u: Sequence, h: Any
     ) -> Iterator[tuple[dict[str, list], dict[str, list]]]:
-        """Yield the coefficients of places and velocities, with time in units of h, one more each time."""
+        """Yield the coefficients of places and velocities, with time in units of h, one order at a time."""
         free, n, zero = self.names.free, len(self.names.free), flint.arb(0)
         x, w = ({name: [value] for name, value in start.items()} for start in (q, v))
         formulas = self.equations.formulas
@@ -513,7 +515,7 @@ class Oracle:
         limits = [plan.small(start[name]) for start in (q, v) for name in free]
         grown = enumerate(self._coefficients(plan, q, v, u, h), start=1)
         for k, (x, w) in itertools.islice(grown, plan.order):
-            # More than two, since every second coefficient may vanish.
+            # More than two are used, since every second coefficient may vanish.
             last = [of[name][-4:] for of in (x, w) for name in free]
             if k > 6 and all(abs(c) < limit for cs, limit in zip(last, limits, strict=True) for c in cs):
                 break
@@ -543,7 +545,7 @@ class Oracle:
         return float(np.abs(np.linalg.solve(mass, drag.astype(np.float64))).sum(axis=1).max())
 
     def _slow(self, plan: Precision, q: dict, v: dict, u: Sequence, left: Any) -> tuple[dict, dict] | None:
-        """Return places and velocities after the time that is left, or None if they are not smooth."""
+        """Return places and velocities after the remaining time, or None if they are not smooth."""
         h, shortest = left, left / 8
         while True:
             found = self._collocated(plan, q, v, u, h)
@@ -598,7 +600,8 @@ class Oracle:
         else:
             return None
         along = once * a
-        # Check smoothness: a polynomial misses the start by a layer that has died out long before the end.
+        # Check smoothness: a polynomial misses the start because of a layer that has died out long before the
+        # end.
         rest, first = nodes.last * along, nodes.first * along
         for c, name in enumerate(free):
             smooth = all(abs(rest[k, c]) < 10 * limits[c] for k in range(rest.nrows()))

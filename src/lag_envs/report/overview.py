@@ -57,13 +57,13 @@ def own_step(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
         for column, ratio in near.items():
             if column.startswith("to ") and ratio is not None:
                 rivals.setdefault(name, []).append((ratio * row["ns"], float(column[3:])))
-    # The faster form of each.
+    # The faster form of each method.
     best = {name: _fastest(points) for name, points in rivals.items()}
     return own_points, {name: points for name, points in best.items() if len(points) > 1}
 
 
 def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
-    """Return the same for a system that is stepped by the general series."""
+    """Return the same results for a system that is stepped by the general series."""
     own_points: Points = []
     rivals: dict[str, Points] = {}
     for row in _rows(accuracy, "general", "general-times-single", system=SYSTEM):
@@ -77,7 +77,7 @@ def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
 
 
 def overview_sentences(accuracy: dict[str, Any]) -> list[str]:
-    """Return sentences on how often a rival is faster at an error, and on the time of a general simulator."""
+    """Return sentences about how often a rival is faster, and about the time of a general simulator."""
     own = list(_rows(accuracy, "work_precision", "work_precision_targets", horizon="one step"))
     modes = ("general-times-single", "general-times-batch")
     systems = [row for name in modes for row in _rows(accuracy, "general", name)]

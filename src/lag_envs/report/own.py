@@ -35,18 +35,18 @@ from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import order_of
 
 SECTION = "own"
-#: Numbers of states with exact ends, and of states for the certificate; then the same for a quick look.
+#: Number of states with exact ends, and of states for the certificate; the same for a quick report.
 MEMBERS, MANY = 50, 1000
 FEW, SOME = 6, 100
 TOLERANCES: Sequence[float] = (1e-3, 1e-6, 1e-9, 1e-12, 1e-14)
 ORDERS: Sequence[int] = (8, 12, 16, 20, 24)
-#: Factors for each parameter alone; the last number is a factor for states.
+#: Factors for each parameter, one parameter at a time; the last number is a factor for states.
 FACTORS, WILD = (1e-4, 1e-2, 1e2, 1e4), 10.0
 #: Allowed excess over a bound by rounding, relative to max(1, |entry|).
 ROUNDING = 1e-12
 #: Allowed imbalance of energy, relative to energy and work.
 BALANCE = 1e-9
-#: How often a step is halved to integrate the work.
+#: How many times a step is halved to integrate the work.
 DEEPEST = 12
 
 
@@ -62,7 +62,7 @@ class Subject(NamedTuple):
     task: type[Any] | None = None
 
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
-        """Return states of episodes under random actions, or random ones without a task; random controls."""
+        """Return states of episodes under random actions (without a task, random states), and random controls."""
         rng = np.random.default_rng(seed)
         low, high = (np.array([box[i] for box in self.controls]) for i in (0, 1))
         controls = rng.uniform(low, high, (count, len(self.controls)))
@@ -98,14 +98,14 @@ def subjects(name: str, tell: Callable[[str], object] = str) -> list[Subject]:
     Parameters
     ----------
     name : str
-        The file, perhaps with a class.
+        The file, optionally with a class.
     tell : callable, optional
-        Is told which scenes are left out, and why.
+        Called with a message about each scene that is left out, and why.
 
     Raises
     ------
     UserError
-        If there are none.
+        If there are no subjects.
     """
     path, kind = own_files.split_path(name)
     found, problems = [], []
@@ -182,7 +182,7 @@ def jobs(quick: bool, file: str) -> list[ReportJob]:
 
 
 def shipped_steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
-    """Yield errors of steps as shipped beside their bounds, and the share certified as a whole."""
+    """Yield errors and bounds of steps as shipped, and the share that is certified as a whole."""
     s = subject(file, name)
     order = order_of(s.scene, s.dt)
     starts, controls = s.draw(SOME if quick else MANY, seed=1)
@@ -206,7 +206,7 @@ def shipped_steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Ro
 
 
 def exact_steps(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return states, controls and the exact ends of their steps; singular ones are left out."""
+    """Return states, controls and the exact ends of their steps; singular cases are left out."""
     starts, controls = s.draw(FEW if quick else MEMBERS)
     kept, high, low = [], [], []
     for j in range(len(starts)):
@@ -273,7 +273,7 @@ def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
 def step_imbalance(scene: Scene, start: Array, held: Array, dt: float) -> float:
     """Return the imbalance between a step's change of energy and its work, relative to energy and work.
 
-    Work is a quadrature along the motion. If that is too coarse, the time is halved.
+    The work is a quadrature along the motion. If the quadrature is too coarse, the time is halved.
     """
     control: Any = held if len(held) else 0.0
     total = size = 0.0

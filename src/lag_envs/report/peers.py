@@ -1,8 +1,8 @@
-"""Other libraries' integrators as rivals, one class each, in the fastest form of each library.
+"""Other libraries' integrators as rivals: a class for each library, in its fastest form.
 
-A library is imported when its rival is first built, which raises if it is missing. All but MuJoCo are given
-the `Equation` of the problems, written once on generic numbers; MuJoCo has its own equations, made from the
-scene's parameters.
+A library is imported when its rival is first built; if it is missing, this raises an error. All but MuJoCo
+are given the `Equation` of the problems, written once on generic numbers; MuJoCo has its own equations, made
+from the scene's parameters.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ SUBSTEPS = (1, 4, 16, 64)
 class LibraryRival(Rival):
     """A rival from another library."""
 
-    #: The methods to measure, each with tolerances, or with substeps per control step if it is fixed.
+    #: The methods to measure, each with tolerances or, if its steps are fixed, with substeps per control
+    #: step.
     settings: ClassVar[dict[str, Sequence[float]]]
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Return whether it can step a scene."""
+        """Return whether the rival can step a scene."""
         return True
 
     def __init__(self, method: str, setting: float) -> None:
@@ -50,8 +51,8 @@ class SciPy(LibraryRival):
     """SciPy's solvers with a compiled right-hand side.
 
     dopri5, dop853 and lsoda are those of `scipy.integrate.ode`, whose loops are compiled and take a tenth of
-    the time of `solve_ivp`. A batch is one system of all states, so they share their steps; its matrix, for
-    lsoda, is banded. Radau is `solve_ivp`'s and has no batch.
+    the time of `solve_ivp`. A batch is one system of all states, so the states share their steps; for lsoda
+    its matrix is banded. Radau is `solve_ivp`'s and has no batch.
     """
 
     family = "scipy"
@@ -156,8 +157,8 @@ def _rate_of_many(equation: Equation) -> Callable:
 class Heyoka(LibraryRival):
     """heyoka's adaptive Taylor series, of an order chosen from the tolerance, with fast_math.
 
-    For one step per control, its compiled step is called from a compiled loop, so that no call from Python
-    counts; over longer times it is `propagate_until`, in one call. A batch goes in blocks of twice the width
+    For one step per control, heyoka's compiled step is called from a compiled loop, so that no call from
+    Python counts; longer times take one call of `propagate_until`. A batch goes in blocks of twice the width
     that heyoka recommends, or of that width ("narrow"), the fastest of those tried.
     """
 
@@ -230,8 +231,8 @@ _engines: list[Any] = []
 def _stepper(integrator: Any) -> int | None:
     """Return the address of heyoka's compiled step, or None if it cannot be loaded.
 
-    It is heyoka's own object code, as its integrator runs it: ``step(state, pars, time, h, coefficients)``,
-    where `h` is the longest allowed step on entry, and the step taken on return.
+    The step is heyoka's own object code, as its integrator runs it: ``step(state, pars, time, h,
+    coefficients)``, where `h` is the longest allowed step on entry, and the step taken on return.
     """
     from importlib.metadata import files
 
@@ -303,7 +304,7 @@ def _loop() -> Callable:
 class Diffrax(LibraryRival):
     """diffrax in one call compiled by XLA: a loop over single states, or a map over a batch.
 
-    Its controller chooses each state's steps, or all steps have one length ("fixed").
+    diffrax's controller chooses each state's steps, or all steps have the same length ("fixed").
     """
 
     family = "diffrax"
@@ -318,7 +319,7 @@ class Diffrax(LibraryRival):
         import jax
 
         span, size, count = dt * steps, problems.equation.size, len(problems)
-        # XLA compiles again for every shape, which takes seconds, so there are few shapes.
+        # XLA compiles again for every shape, which takes seconds, so few shapes are used.
         shape = next((n for n in ((128, 1024) if together else (64,)) if n >= count), count)
         y, p = (
             jax.numpy.asarray(blocks(x, shape).swapaxes(1, 2)[0]) for x in (problems.y[:size], problems.p)
@@ -334,7 +335,7 @@ class Diffrax(LibraryRival):
 
 @cache
 def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Callable:
-    """Compile ``solve(y, p, count, span, setting)``, where the setting is tolerance or step."""
+    """Compile ``solve(y, p, count, span, setting)``, whose setting is the tolerance or the step."""
     # Read when JAX starts: one core, like all others.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     import diffrax
@@ -370,7 +371,7 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
 
 
 class Torchdiffeq(LibraryRival):
-    """torchdiffeq on tensors of all states, which share their steps; its loop over steps is in Python."""
+    """torchdiffeq on tensors of all states, which share their steps; the loop over steps is in Python."""
 
     family = "torchdiffeq"
     settings: ClassVar = {
@@ -388,7 +389,7 @@ class Torchdiffeq(LibraryRival):
         numbers = torch.from_numpy(problems.p)
         times = torch.tensor([0.0, span], dtype=torch.float64)
         options: dict[str, Any] = {"rtol": self.setting, "atol": self.setting, "method": self.method}
-        # A step has to land on the end: interpolation is of lower order than the steps.
+        # A step has to end at the end time, as interpolation is of lower order than the steps.
         options["options"] = {"step_t": times[1:], "first_step": dt}
         if self.fixed:
             step = span / self.substeps(steps)
@@ -436,7 +437,7 @@ class MuJoCo(LibraryRival):
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Return whether there is a model of the scene."""
+        """Return whether MuJoCo has a model of the scene."""
         return isinstance(scene, PivotedBar)
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
@@ -459,7 +460,7 @@ class MuJoCo(LibraryRival):
         ]  # fmt: skip
         data = mujoco.MjData(models[0])
         start = np.array([(0.0, *case.state) for case in problems.cases])
-        # A long rollout would store every step, but only its end is needed.
+        # A long rollout would store every step, although only its end is needed.
         chunk = min(n, 1000)
         path = np.empty((len(models), chunk, start.shape[1]))
         ends = start.copy()

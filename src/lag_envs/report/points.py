@@ -47,7 +47,7 @@ class WorkPrecisionPoint(NamedTuple):
 
     @property
     def diverged(self) -> int:
-        """Number of members that were lost."""
+        """Number of lost members."""
         return sum(error is None for error in self.errors)
 
     @property
@@ -73,10 +73,10 @@ class WorkPrecisionPoint(NamedTuple):
 
 
 def gathered(rows: Sequence[Row]) -> list[WorkPrecisionPoint]:
-    """Return the points, with all times as on a machine of one speed.
+    """Return the points, with all times converted to the same speed of the machine.
 
-    Each job timed lag_envs in turn with its own samples, as a clock. Times are multiplied by the ratio
-    of the clock in our own job to that job's clock. A method without a batch counts there as it does alone.
+    Each job timed lag_envs in turn with its own samples, as a clock. Times are multiplied by the ratio of the
+    clock in our own job to that job's clock. A method without a batch has the same times in a batch as alone.
     """
     measured = [r for r in rows if r["kind"] == "point" and "problem" not in r]
     clocks = {

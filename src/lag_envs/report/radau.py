@@ -15,7 +15,7 @@ from lag_envs.report.timing import Sample
 from lag_envs.stepping.compiling import compile_function, compile_lines
 
 A = np.array(RADAU)
-#: Relative size of the last correction, iterations at most, and the step of the Jacobian's differences.
+#: Relative size of the last correction, largest number of iterations, and step of the Jacobian's differences.
 LAST, MOST, APART = 1e-14, 20, 1e-7
 
 SOURCE = """
@@ -64,7 +64,7 @@ def radau(starts, p, ends, a, n, h):
 
 
 class CompiledRadau(Rival):
-    """Radau IIA with steps of one length."""
+    """Radau IIA with steps of equal length."""
 
     family = "compiled"
     fixed, batched = True, False

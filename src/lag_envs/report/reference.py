@@ -44,14 +44,15 @@ def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: i
 def exact_flow(scene: Scene, state: Sequence[Any], controls: Any, dt: Any, digits: int = 30) -> list[mpf]:
     """Return the state after a time dt with the controls held.
 
-    From the oracle, see `Oracle.flow`; undamped pendulums that move far use their closed form.
+    The state is computed by the oracle, see `Oracle.flow`, or by the closed form for undamped pendulums that
+    move far.
     """
     oracle = oracle_of(scene)
     return agreed(lambda working: once(oracle, state, controls, dt, working), digits)
 
 
 def remembered(scene: Scene, state: Sequence[float], controls: Any, dt: float) -> list[mpf]:
-    """Return the result of `exact_flow` with 30 digits, from `store` if it is known there."""
+    """Return the result of `exact_flow` with 30 digits, from `store` if it is stored there."""
     problem = repr((type(scene), scene, *(float(x).hex() for x in (*state, *control_list(controls), dt))))
     file = store and store / f"{hashlib.sha256(problem.encode()).hexdigest()[:24]}.json"
     with mp.workdps(40):

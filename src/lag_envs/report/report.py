@@ -36,11 +36,11 @@ class ReportSettings:
 
 
 class NotAReport(UserError):
-    """The folder holds something else."""
+    """Raised if the folder holds something else."""
 
 
 def make_report(settings: ReportSettings) -> bool:
-    """Measure what the folder lacks and write everything; return False if interrupted.
+    """Measure everything that the folder lacks and write all results; return False if interrupted.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def make_report(settings: ReportSettings) -> bool:
 
 
 def prepare(folder: Path) -> Path:
-    """Return the folder, which is new, empty or already a report's."""
+    """Return the folder, which must be new, empty or already a report's."""
     if folder.exists() and not folder.is_dir():
         raise NotAReport(f"{folder} is not a folder; name a new or an empty one")
     folder.mkdir(parents=True, exist_ok=True)

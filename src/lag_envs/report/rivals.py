@@ -1,9 +1,8 @@
 """The methods to compare: lag_envs, and rivals of any kind behind one interface, each in its fastest form.
 
-A `Rival` is built for some `Problems` and a time over which their controls are held. It then runs, and is
-timed, in one call for all of them over the whole time: in compiled loops if it has them, on blocks of states
-at once if it can take them, with its own choice of steps if it has one. Errors are those of the very calls
-that are timed.
+A `Rival` is built for some `Problems` and a time over which their controls are held. It runs, and is timed,
+in one call for all problems over the whole time: in compiled loops, on blocks of states at once, and with its
+own choice of steps, whichever of these it offers. Errors are those of the same calls that are timed.
 
 `ShippedStepping` and `CompiledMethod` are compiled by our machinery; other libraries are in `peers`.
 """
@@ -35,14 +34,15 @@ class Rival(ABC):
     method : str
         One of its methods.
     setting : float
-        A tolerance, or for methods that are `fixed` the substeps per control step; 1/4 is one step for four.
+        A tolerance or, for methods that are `fixed`, the substeps per control step; 1/4 is one step for four
+        control steps.
     """
 
-    #: Where it comes from: a package's name, "compiled", or "lag_envs".
+    #: The origin of the method: a package's name, "compiled", or "lag_envs".
     family: ClassVar[str]
-    #: Whether all steps have one length, so that time goes with their number whatever the horizon.
+    #: Whether all steps have the same length, so that time is proportional to their number for any horizon.
     fixed = False
-    #: Whether it can take many states at once.
+    #: Whether the method can take many states at once.
     batched = True
     #: Whether the states of a batch share their steps, so that each one's error depends on the others.
     shared = False
@@ -54,7 +54,7 @@ class Rival(ABC):
 
     @abstractmethod
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
-        """Compile what can be compiled and return the call, with its end states.
+        """Compile everything that can be compiled and return the call, with its end states.
 
         Parameters
         ----------
@@ -65,17 +65,18 @@ class Rival(ABC):
         steps : int
             For how many control steps each control is held.
         together : bool
-            Take all states at once; otherwise one after the other.
+            Whether to take all states at once, otherwise one after the other.
         changes : int, default 1
-            For timing single steps: how many of them follow one another in the call. Alone, each problem goes
-            on with the next one's control; in a batch, with its own. The end states are then of no use.
+            For timing single steps, the number of steps that follow one another in the call. In a call state
+            by state, each problem continues with the next problem's control; in a batch, with its own
+            control. The end states then have no meaning.
 
         Raises
         ------
         ImportError
             If the library is missing.
         ValueError
-            For an equation that it cannot solve.
+            For an equation that the method cannot solve.
         """
 
     def substeps(self, steps: int) -> int:
@@ -86,7 +87,7 @@ class Rival(ABC):
 class ShippedStepping(Rival):
     """The shipped stepping: a scene's own flow, and no other order or tolerance.
 
-    The setting is the number of steps per control step: for another accuracy, users choose another `dt`.
+    The setting is the number of steps per control step, because users change the accuracy by another `dt`.
     """
 
     family = "lag_envs"
@@ -134,8 +135,8 @@ class ShippedStepping(Rival):
 class CompiledMethod(Rival):
     """An integrator of `METHODS`, compiled like lag_envs: with the same recorder, compiler and vector width.
 
-    Coefficients are precomputed, so that only the method is timed. Alone: one compiled loop over steps and
-    trajectories. In a batch: one compiled loop over blocks of states.
+    Coefficients are precomputed, so that only the method is timed. Single states are stepped in one compiled
+    loop over steps and trajectories, batches in one compiled loop over blocks of states.
     """
 
     family = "compiled"

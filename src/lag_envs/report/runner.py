@@ -1,4 +1,4 @@
-"""Jobs in separate processes: one that hangs or crashes loses only its own rows.
+"""Jobs in separate processes, so that a job that hangs or crashes loses only its own rows.
 
 Every finished job is written at once, so that an interrupted report resumes where it was.
 """
@@ -40,15 +40,15 @@ class ReportJob:
     """A piece of work that takes seconds.
 
     ``function``, as "module:name" within this package or "package.module:name", is called with the arguments
-    and yields rows of JSON types. It may raise: earlier rows are kept and the problem is noted.
+    and yields rows of JSON types. If it raises an error, earlier rows are kept and the error is noted.
     """
 
     section: str
     name: str  #: describes the work; unique within the section
     function: str
     arguments: dict[str, Any] = field(default_factory=dict)
-    timeout: float = 120.0  #: seconds until it counts as hanging
-    alone: bool = False  #: measures time, so nothing else may run at the same time
+    timeout: float = 120.0  #: seconds until the job counts as hanging
+    alone: bool = False  #: whether it measures time, so that nothing else may run at the same time
 
     @property
     def key(self) -> str:
@@ -71,7 +71,7 @@ class JobResult:
 
 @cache
 def fingerprint() -> str:
-    """Return a digest of code, libraries and machine: rows with another digest are not reused."""
+    """Return a digest of code, libraries and machine; rows with another digest are not reused."""
     digest = hashlib.sha256(json.dumps([machine(), versions()], sort_keys=True).encode())
     for path in sorted(Path(lag_envs.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -92,11 +92,11 @@ def run_jobs(
     Parameters
     ----------
     jobs : sequence of ReportJob
-        Those that measure time run after the others, one by one.
+        The jobs; those that measure time run after the others, one by one.
     folder : Path
         Results are appended to ``results.jsonl`` in it; references are kept there too.
     processes : int
-        How many may run in parallel.
+        Number of jobs that may run in parallel.
     tell : callable, optional
         Called with a line about each job that failed.
 
@@ -151,7 +151,7 @@ def _in_processes(jobs: Sequence[ReportJob], folder: Path, count: int) -> Iterat
                 outcome = f"stopped after {job.timeout:.0f} s", job.timeout
             elif isinstance(outcome, BaseException):
                 outcome = died(outcome), 0.0
-            # Including the rows from before it died.
+            # The rows from before the process died are included.
             yield JobResult(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
 
 
@@ -178,12 +178,12 @@ def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | N
 
 
 def module(name: str) -> Any:
-    """Return a module of this package, or, if the name has a dot, of another one."""
+    """Return a module of this package or, if the name has a dot, of another package."""
     return import_module(name if "." in name else f"lag_envs.report.{name}")
 
 
 def error_line(error: BaseException) -> str:
-    """Return an error as one line; for a missing package, that it is not installed.
+    """Return an error as one line; for a missing package, the line says that it is not installed.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Where a step is accurate, inaccurate, or refused: maps and a table of named cases."""
+"""Where a step is accurate, inaccurate or refused, shown by maps and a table of named cases."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from lag_envs.scenes.derivation import motion_constants_of
 __all__ = ["content", "extreme_errors", "jobs", "largest_errors", "map_errors", "methods", "step_cases"]
 
 SECTION = "stability"
-#: Precisions of the comparison integrators, and what their names end with.
+#: Precisions of the comparison integrators, and the endings of their names.
 PRECISIONS: dict[str, type[np.floating]] = {"": np.float64, ", float32": np.float32}
 
 
@@ -111,7 +111,7 @@ def extreme_errors(names: Sequence[str]) -> Iterator[Row]:
 
 
 def largest_errors(case: Case, dt: float, ends: dict[str, Any]) -> Row:
-    """Return the largest error of each end relative to the scales; if there is none, the reason."""
+    """Return the largest error of each end relative to the scales, or the reason why there is none."""
     try:
         exact = reference.remembered(case.scene, case.state, case.control, dt)
     except ArithmeticError as error:  # such as oracle.Unresolved
@@ -164,7 +164,7 @@ def _shipped(case: Case, dt: float) -> Any:
 
 
 def _count(case: Case, dt: float) -> float:
-    """Return the number of plain substeps for accuracy: from the bound, or from `within`."""
+    """Return the number of plain substeps needed for accuracy, by the bound or by `within`."""
     scene, state, control = case
     bound = scene.step_bound(state, control, dt)
     if bound.order:

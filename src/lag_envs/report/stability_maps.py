@@ -41,7 +41,7 @@ def _drag(scene: Scene) -> float:
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:
-    """Return a case with a closed-form reference, however far it goes: shells have no drive."""
+    """Return a case that has a closed-form reference however far it moves; shells have no drive."""
     state, u = STARTS[name]
     if speed is not None:
         state = (state[0], speed, *state[2:])

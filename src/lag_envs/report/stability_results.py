@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 PEERS = ("ETD4RK", "implicit midpoint", "RK4", "Verlet", "explicit Euler")
 #: Contents of a cell other than an error.
 REFUSED, DIVERGED, NO_REFERENCE, TOO_LONG = "refused", "diverged", "no reference", "not run"
-#: An error of this many times the state's size counts as divergence, like a result that is not finite.
+#: An error above this many times the state's size counts as divergence, like a result that is not finite.
 FAR_OFF = 100.0
-#: Most substeps for the formulas alone, without the jump along the slow manifold.
+#: Largest number of substeps for the formulas alone, without the jump along the slow manifold.
 MOST_SUBSTEPS = 1000
 #: Colours of cells without an error; errors go from pale yellow to dark blue.
 SPECIAL = {DIVERGED: "black", REFUSED: "#d55e00", TOO_LONG: "#d0d0d0", NO_REFERENCE: "#8c8c8c"}
@@ -138,7 +138,7 @@ def _map_table(maps: dict[tuple[str, str], list[Row]]) -> Table:
 
 
 def _shares(maps: dict[tuple[str, str], list[Row]], name: str, caption: str) -> Table | None:
-    """Return a table with a line for each map: our results, and each method's share of exact cells."""
+    """Return a table with a line for each map, with our results and each method's share of exact cells."""
     lines: list[list[Any]] = []
     for (map, scene), rows in maps.items():
         _, largest, *_ = _counts(rows, LAG_ENVS)

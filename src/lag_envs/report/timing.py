@@ -1,7 +1,7 @@
 """A control step by any flow, compiled for one trajectory and for a batch, and its time.
 
-Both are made from the same recorded code, by the same compiler at the same vector width, for our methods and
-others, so that times compare methods.
+For our methods and others alike, the code is recorded in the same way, and compiled by the same compiler at
+the same vector width, so that times compare methods.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def at_once(kernels: FlowSteps, cases: Sequence[Case], steps: int, dt: float) ->
 def interleaved(
     samples: Sequence[Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
 ) -> list[float]:
-    """Return each sample's time of a control step [ns], the median over rounds.
+    """Return each sample's time of a control step [ns], as the median over rounds.
 
     Every round runs each sample once, so that a slow phase of the machine affects all of them.
 

@@ -33,12 +33,12 @@ from lag_envs.stepping.flows import Flow
 __all__ = ["content", "jobs", "orders", "state_errors", "variant_points"]
 
 SECTION = "work_precision"
-#: Orders of the series whose convergence is measured; orders that are not shipped are used for nothing else.
+#: Orders of the series whose convergence is measured; those that are not shipped are used only for this.
 ORDERS = tuple(range(4, 21, 2))
 
 
 class Horizon(NamedTuple):
-    """How long the control is held, and the measurements over that time."""
+    """A time for which the control is held, and the measurements over that time."""
 
     seconds: float | None  #: None: one control step
     members: int  #: problems
@@ -61,19 +61,19 @@ QUICK = {
 }
 QUICK_METHODS = ("Verlet", "RK4", "RK4, carried", "DOP853, carried")
 QUICK_VARIANTS = ("PivotedBar",)
-#: Libraries that are slow to compile or to run; measured on one variant per kind of equation.
+#: Libraries that are slow to compile or to run, so they are measured on one variant per kind of equation.
 COVERED = {
     "diffrax": ("PivotedBar", "Incline, moving", "CylinderInCylinder, tilt"),
     "torchdiffeq": ("PivotedBar", "Incline, moving", "CylinderInCylinder, tilt"),
 }
-#: Seconds that the errors of one point may take; slower points are not run.
+#: Longest time for the errors of one point [s]; slower points are not run.
 LIMIT = 2.0
 #: Approximate seconds for one sample of its time.
 SAMPLE = 0.02
 
 
 def control_step(variant: str) -> float:
-    """Return the control step [s] rounded to a multiple of 2^-36: its products with integers are exact."""
+    """Return the control step [s], rounded to a multiple of 2^-36 to make its products with integers exact."""
     return round(VARIANTS[variant].dt * 2**36) / 2**36
 
 
@@ -117,14 +117,14 @@ def jobs(quick: bool) -> list[ReportJob]:
 
 
 def problems(horizon: str, cases: Sequence[Case]) -> list[Case]:
-    """Return the cases of a horizon; those over 1,000 s have no control, and pendulums no damping."""
+    """Return the cases of a horizon; over 1,000 s there is no control, and pendulums have no damping."""
     if horizon != "1,000 s":
         return list(cases)
     return [Case(_undamped(case.scene), case.state, 0.0) for case in cases]
 
 
 def _undamped(scene: Scene) -> Scene:
-    """Return a scene whose motion has a closed form: without damping, if it is stepped by series."""
+    """Return a scene whose motion has a closed form; a scene stepped by series loses its damping."""
     if not Stepped(scene).flow.order:
         return scene
     return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
@@ -148,7 +148,7 @@ class ExactEnd(NamedTuple):
 
 
 def exact_end(case: Case, dt: float, steps: int) -> ExactEnd:
-    """Return the exact end; errors of one step are relative to the start's size, later ones to the end's."""
+    """Return the exact end; errors of one step are relative to the start's size, others to the end's."""
     end = reference.remembered(case.scene, case.state, case.control, dt * steps)
     at = case if steps == 1 else case._replace(state=tuple(map(float, end)))
     return ExactEnd(case, end, scales(at, dt))
@@ -176,7 +176,7 @@ def amplified(some: Sequence[ExactEnd], dt: float, steps: int) -> float:
 
 
 def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
-    """Compute the exact ends, which are kept for the other jobs; yield amplified roundings."""
+    """Compute the exact ends and keep them for the other jobs; yield amplified roundings."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     dt = control_step(variant)
     found = truths(variant, horizon, plan)
@@ -221,7 +221,7 @@ def variant_rivals(variant: str, horizon: str, family: str, quick: bool) -> list
 def variant_points(variant: str, family: str, quick: bool) -> Iterator[Row]:
     """Yield errors and times of a family on a variant, alone and in a batch.
 
-    Every row has as its `clock` our time of a control step, measured in turn with it in the same job.
+    Every row has as its `clock` our time of a control step, measured in turn with the row in the same job.
     """
     dt = control_step(variant)
     for horizon, plan in (QUICK if quick else HORIZONS).items():
@@ -271,7 +271,7 @@ def point(
     Raises
     ------
     TimeoutError
-        If it would take too long.
+        If the measurement would take too long.
     """
     members = [t.case for t in some]
     # If states share their steps, errors are from a batch as large as the timed one.
@@ -288,7 +288,7 @@ def point(
 
 
 def _seconds(rival: Rival, cases: Sequence[Case], dt: float, steps: int, together: bool) -> float:
-    """Estimate the time of a call from one for a hundredth of the time; compile on the way."""
+    """Estimate the time of a call from a call for a hundredth of the span, which also compiles."""
     part = max(1, steps // 100)
     sample = rival.build(Problems(cases), dt, part, together)
     sample.end()
@@ -300,11 +300,11 @@ def _seconds(rival: Rival, cases: Sequence[Case], dt: float, steps: int, togethe
 def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: bool) -> Sample:
     """Return a sample of some milliseconds, in one call, all in compiled loops if the rival has them.
 
-    A step costs the same over a long time as over a short one, so a slow rival is timed over part of it.
+    A step costs the same over a long time as over a short time, so a slow rival is timed over a part only.
     """
     if steps == 1 and rival.changing:
         each = rival.substeps(1) if rival.fixed else 1
-        if together:  # few, since a constant control drives states far away
+        if together:  # only few, since a constant control drives states far away
             return rival.build(Problems(base), dt, 1, True, max(1, 4 // each))
         return rival.build(Problems(base[:8]), dt, 1, False, max(8, 512 // each))
     some = base if together else base[:1]
@@ -322,7 +322,7 @@ def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: b
 def mirrored(cases: Sequence[Case], low: float, high: float) -> list[Case]:
     """Return cases in which every second control is the one before, mirrored within its range.
 
-    So no drive builds up over successive controls.
+    In this way no drive builds up over successive controls.
     """
     return [
         case._replace(control=low + high - cases[i - 1].control) if i % 2 else case
@@ -386,13 +386,13 @@ def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[ExactE
 
 
 def measured_order(found: OrderedMethod, ends: Mapping[float, Sequence[ExactEnd]]) -> float | None:
-    """Return the slope of the error of one step over its length, minus one; None if there is none."""
+    """Return the slope of the error of one step over its length, minus one; None if it has no slope."""
     kernels = FlowSteps(next(iter(ends.values()))[0].case.scene, found.flow)
     return observed_order({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
 
 
 def observed_order(found: Mapping[float, Sequence[float]]) -> float | None:
-    """Return the observed order from the errors of steps of several lengths, as median over members.
+    """Return the observed order from the errors of steps of several lengths, as the median over members.
 
     The comparison uses the shortest steps h and 2h whose errors are well above rounding in half of the
     members.

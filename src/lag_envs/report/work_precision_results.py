@@ -28,13 +28,13 @@ from lag_envs.report.runner import JobResult, Row
 
 #: An error below this many roundings, or amplified roundings, counts as no error at all.
 ROUNDINGS = 4
-#: The ones in the table of docs/accuracy.md.
+#: The errors in the table of docs/accuracy.md.
 SHOWN = TARGETS[1:]
 #: Error at which lag_envs is claimed to be the fastest: the promised accuracy of a step, and what the
 #: system's amplification leaves of it over a long time.
 CLAIMED = {"one step": 1e-12, "10 s": 1e-12, "1,000 s": 1e-9}
 
-#: Required error of each form's finest setting, so that none is fast because it is broken.
+#: Required error of each form's finest setting, so that no form is fast because it is broken.
 ACCURATE = 1e-9
 
 
@@ -46,7 +46,7 @@ def floors(rows: Sequence[Row]) -> dict[tuple, float]:
 
 
 class Duel(NamedTuple):
-    """The fastest form of lag_envs and the fastest rival to reach an error: one variant, horizon and mode."""
+    """The fastest form of lag_envs and the fastest rival at an error, for a variant, horizon and mode."""
 
     variant: str
     horizon: str
@@ -62,7 +62,7 @@ class Duel(NamedTuple):
 
     @property
     def lost(self) -> bool:
-        """Whether a rival is faster, or the only one that reaches the error."""
+        """Whether a rival is faster, or alone reaches the error."""
         return self.rival is not None and (self.ratio is None or self.ratio < 1.0)
 
     @property
@@ -340,7 +340,7 @@ def _all(points: Sequence[WorkPrecisionPoint]) -> Table:
 
 
 def claims(rows: Sequence[Row], points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> list[Claim]:
-    """Return the claims; whether they hold is measured, and docs/accuracy.md lists those that do not."""
+    """Return the claims and whether they hold; docs/accuracy.md lists the claims that do not."""
     steps = [p for p in points if p.own and p.method == LAG_ENVS and p.horizon == "one step"]
     largest = max((p.worst for p in steps), default=math.nan)
     finest = _finest(points)
@@ -408,12 +408,12 @@ def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
     )
 
 
-#: Methods of lower order, which are not asked to be accurate.
+#: Methods of lower order, which are not required to be accurate.
 LOW = ("explicit Euler", "semi-implicit Euler", "Verlet", "implicit midpoint", "Euler", "implicitfast")
 
 
 def _finest(points: Sequence[WorkPrecisionPoint]) -> dict[tuple[str, str], float]:
-    """Return the smallest error that each form of each rival has in one step, by method and place."""
+    """Return the smallest error of each form of each rival in one step, by method and place."""
     found: dict[tuple[str, str], float] = {}
     for p in points:
         low = p.method.partition(",")[0] in LOW
