@@ -337,7 +337,7 @@ def test_a_slower_rival_is_a_win():
 def test_a_rival_that_gets_there_alone_is_a_defeat():
     rows = both(LAG_ENVS, 100.0, 1e-10, family="lag_envs") + both("DOP853", 250.0, 1e-13)
     assert claimed(rows).holds is False and "lag_envs not at all" in claimed(rows).evidence
-    assert "lag_envs does not get there and a rival does in 2" in " ".join(
+    assert "lag_envs does not reach the error and a rival does in 2" in " ".join(
         work_precision.content(rows, []).text
     )
 
@@ -402,8 +402,8 @@ def assert_sentences_agree(text, columns, rows):
             if won:
                 assert re.search(rf"takes {won[0]:.2g}( to {won[-1]:.2g})? times as long", sentence)
             for words, own, other in (
-                ("nobody else gets there", True, False), ("nobody gets there", False, False),
-                ("lag_envs does not get there and a rival does", False, True),
+                ("no other method reaches the error", True, False), ("no method reaches the error", False, False),
+                ("lag_envs does not reach the error and a rival does", False, True),
             ):  # fmt: skip
                 count = sum(bool(r["lag_envs"]) == own and bool(r["fastest other"]) == other for r in here)
                 assert (f"{words} in {count} (" in sentence) == bool(count)

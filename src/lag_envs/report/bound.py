@@ -279,9 +279,8 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
             ReportFigure(
                 "bound-cost",
                 "What the bound costs: the substeps that it requires against the fewest that reach 1e-12, "
-                "order "
-                "16, random drives and steps. Circles grow with the number of cases. On the line nothing is "
-                "wasted.",
+                "order 16, random drives and steps. Circles grow with the number of cases. On the line no "
+                "substep is wasted.",
                 lambda: _draw_cost(counted),
             )
         )
@@ -292,9 +291,9 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
             "it is compared with the true truncation error: the sum of the exact motion's Taylor "
             f"coefficients beyond the order, which the oracle computes with {DIGITS} digits. Rounding "
             "plays no part.",
-            "The bound holds for every field, drag and drive of a given size, whatever the angle, so it "
-            "is far above the truncation error of most steps. That costs little: a series of order N makes "
-            "up for such a factor by a step that is shorter by the factor's (N + 1)th root.",
+            "The bound holds for every field, drag and drive of a given size, whatever the angle, so it is "
+            "far above the truncation error of most steps. That costs little, because a series of order N "
+            "compensates such a factor by a step that is shorter by the factor's (N + 1)th root.",
             _cost_text(kinds["cost"]),
         ],
         tables=[table for table in (tight, scenes, _problem_table(problems)) if table],
@@ -326,9 +325,9 @@ def _tightness_table(rows: Sequence[Row]) -> Table | None:
         lines.append([f"order {order}", len(found), *angle, *speed, per_power])
     parts = [f"{sign}: {q}" for _, sign, _ in QUANTITIES for q in ("least", "10 %", "50 %", "90 %")]
     caption = (
-        "Bound over truncation error of one step, both in exact arithmetic, for random drives. It is never "
-        "below 1 if the bound is never broken. 50 % is the median. Per power: the (order + 1)th root of the "
-        "median for θ', the factor by which the bound overestimates the step's length."
+        "Ratio of bound to truncation error of one step, both in exact arithmetic, for random drives. The "
+        "ratio is never below 1 if the bound is never broken; 50 % is the median. Per power: the (order + "
+        "1)th root of the median for θ', the factor by which the bound overestimates the step's length."
     )
     columns = ["series", "steps", *parts, "per power"]
     return Table("bound-tightness", caption, columns, lines) if lines else None
@@ -350,9 +349,8 @@ def _reach_table(steps: Sequence[Row], reaches: Sequence[Row]) -> Table | None:
         "bound-environments",
         "Each environment with a pendulum: the speed up to which one series per step is certified to have "
         "a truncation error of at most 1e-12 rad/s under its largest controls, and the speed up to which "
-        "it really has, at "
-        "all angles tried; the largest truncation met within the certified speeds, and the bound over the "
-        "truncation (least, median).",
+        "the error really is that small at all angles tried; the largest truncation error found within the "
+        "certified speeds, and the ratio of bound to truncation error (smallest, median).",
         [
             "id",
             "dt [s]",

@@ -136,7 +136,7 @@ def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArr
 
 
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
-    """Yield the drifts of a run without drag and drive; for lag_envs also its error and amplified rounding."""
+    """Yield the drifts of a run without drag and drive; for lag_envs also error and amplified rounding."""
     problem = FREE[name]
     scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
@@ -234,20 +234,20 @@ def worst(values: Sequence[float | None]) -> float | None:
 
 
 TEXT = (
-    "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is computed from the "
-    "cosine and sine that are stepped. Its drift is relative to kinetic plus potential energy at the "
-    "start, or to the kinetic energy where that has become larger. The comparison integrators take one "
-    "step per control step.",
+    "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is computed from the cosine "
+    "and sine that are stepped. Its drift is relative to kinetic plus potential energy at the start, or to "
+    "the kinetic energy if that has become larger. The comparison integrators take one step per control "
+    "step.",
     "The growth of our error is checked against the closed form, Jacobi's elliptic functions or a "
     "parabola, in 30 digits. The rounding floor is a one-ulp perturbation, propagated exactly: the start "
     "is moved by 2^-53 of its size, at least 1 rad or rad/s, in both entries. A step rounds its result at "
-    "least once, and n random roundings add up to about √n of one, so the error is compared with √n times "
-    "the floor.",
-    "Two effects are larger than that. If energy drifts steadily (growth 1), because the same roundings "
-    "recur in every period, the error grows with the square of the time. On the incline place and speed "
-    "grow without end, and equal increments round to the same side for long stretches.",
-    "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which do"
-    " not affect the cosine and sine that are stepped.",
+    "least once, and n random roundings add up to about √n times a single rounding, so the error is "
+    "compared with √n times the floor.",
+    "Two effects can be larger than √n roundings. If energy drifts steadily (growth 1), because the same "
+    "roundings recur in every period, the error grows with the square of the time. On the incline place "
+    "and speed grow without end, and equal increments round to the same side for long stretches.",
+    "The angle θ is not wrapped. If a bar turns over many times, the angle is a large number with large "
+    "roundings, but these do not affect the cosine and sine that are stepped.",
     "With drag and random controls the change of energy is compared with the work of the drive minus the "
     "loss to drag, both by Gauss quadrature with 16 nodes within each step.",
 )
@@ -257,12 +257,12 @@ DRIFT = (
     " steady. Empty cell: not finite, refused, or not applicable."
 )
 GROWTH = (
-    "Error of θ or x at the end of a run, one rounding as amplified by the scene, the largest ratio of the"
-    " error to √n amplified roundings, and the exponents of growth."
+    "Error of θ or x at the end of a run, one rounding as amplified by the scene, the largest ratio of the "
+    "error to √n amplified roundings, and the exponents with which error and rounding grow."
 )
 BALANCE = (
-    "Change of energy minus work plus loss [J]: the largest of a step, and the sum over the run; beside them"
-    " the largest energy and the total of work and loss."
+    "Change of energy minus work plus loss [J]: the largest in a step, and the sum over the run; for "
+    "comparison the largest energy and the total of work and loss."
 )
 
 

@@ -33,7 +33,7 @@ DETAILS = "accuracy-details.md"
 OVERVIEW = ReportFigure(
     "overview",
     "Error against run time. The shortest time of one control step in which each method reaches an error, "
-    "with only the state, not in a batch. Rivals get their fastest form.",
+    "with only the state, not in a batch. Rivals are in their fastest form.",
     lambda: overview.draw_overview({}),
     raster=True,
 )
@@ -52,9 +52,9 @@ PARTS = (
     PagePart(
         "work_precision",
         "One step of the package's scenes",
-        "Bar, incline and shell have dedicated steps. lag_envs is as shipped, at rounding error; a rival is "
-        "given the scene's own equation and its fastest form, with the setting that just reaches an "
-        "error. Only lag_envs has a bound before the step. The table names the fastest rival "
+        "Bar, incline and shell have dedicated steps. lag_envs is measured as shipped, at rounding error. "
+        "A rival gets the scene's own equation, and is in its fastest form, with the setting that just "
+        "reaches an error. Only lag_envs has a bound before the step. The table names the fastest rival "
         "for each error, with its time as a multiple of that of lag_envs: below 1 the rival is faster.",
         (),
     ),
@@ -62,8 +62,8 @@ PARTS = (
         "general",
         "One step of scenes defined by energies alone",
         "Here the equations are derived from the energies and stepped by the general Taylor series, which "
-        "certifies each step. The other methods give no bound: which of their settings reaches an error is "
-        "known here only from exact solutions.",
+        "certifies each step. The other methods give no bound, so only a comparison with exact solutions "
+        "shows which of their settings reach an error.",
         ("general-double",),
     ),
     PagePart(
@@ -79,15 +79,16 @@ PARTS = (
         "stability",
         "Stiffness and extremes",
         "Each cell of a map is one control step, for increasing damping and step length. Heavy damping "
-        "breaks explicit methods and degrades implicit ones. Beside the maps there are named "
-        "cases, from a bar of 1e-8 m to drives of 1e6: each is either accurate or refused with an error.",
+        "breaks explicit methods and degrades implicit ones. In addition to the maps there are named "
+        "cases, from a bar of 1e-8 m to drives of 1e6: each step is either accurate or refused with an "
+        "error.",
         ("stability-damping-pivotedbar.png", "extreme-cases-map"),
     ),
     PagePart(
         "conservation",
         "Conservation",
-        "Without drag and drive, energy must not change. The table has its largest drift over a very long "
-        "run.",
+        "Without drag and drive, energy must not change. The table shows the largest drift of energy over "
+        "a very long run.",
         ("conservation-energy",),
     ),
     PagePart(
@@ -100,9 +101,9 @@ PARTS = (
     PagePart(
         "leave_out",
         "What is left out",
-        "A constant that is zero costs no operation, and the state holds only what an environment "
-        "needs. The table shows the parts of each environment's step, the figure what leaving "
-        "something out saves.",
+        "A constant that is zero costs no operation, and the state holds only what an environment needs. "
+        "The table shows the parts of each environment's step, and the figure how much time is saved by "
+        "leaving something out.",
         ("leave-out",),
     ),
 )
@@ -212,8 +213,8 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     lines = [
         "# Accuracy",
         "",
-        "What was measured, how other methods compare, and where they are better. This page is generated "
-        "from the measurements of `lag-envs report`.",
+        "This page shows what was measured, how other methods compare, and where they are better. This "
+        "page is generated from the measurements of `lag-envs report`.",
         "",
         "## Error against run time",
         "",
@@ -259,8 +260,8 @@ INTRODUCTION = """\
 One control step, with its control held, is accurate to 1e-12: |error of θ| ≤ 1e-12 max(1, |θ|, |θ̇| dt) and
 |error of θ̇| ≤ 1e-12 max(1, |θ̇|, (α² + β²)^¼), where θ̈ = -α sinθ - β cosθ - γθ̇ + …. The same holds for lengths
 ([numerics](numerics.md)). This covers all environments that have a specialised integrator (driven pendulums
-and slopes), over the ordinary ranges of their parameters, with damping γ dt up to 1e6. At extremes, the
-system itself amplifies a rounding of its state or parameters; there the error stays within ten times that
+and slopes), over the ordinary ranges of their parameters, with damping γ dt up to 1e6. In extreme cases, the
+system itself amplifies a rounding of its state or parameters; the error then stays within ten times that
 amplification. A step that would need more than a million substeps, or has no finite result, raises
 `StepRefused` and leaves the state as it was.
 
@@ -272,7 +273,7 @@ look). It also writes a page with all rows as CSV and JSON."""
 
 FIRST = (
     "Only lag_envs proves a bound on its truncation error, before the step or along with it. The errors of "
-    "the others were found afterwards, by comparison with exact solutions.",
+    "the other methods were found afterwards, by comparison with exact solutions.",
     "In the left panel lag_envs is a single point, at rounding error: a coarser setting would not be faster.",
 )
 
@@ -282,7 +283,7 @@ def details(accuracy: dict[str, Any]) -> str:
     lines = [
         "# Accuracy: details",
         "",
-        "The report in full. [Accuracy](accuracy.md) is the page to read first.",
+        "This is the full report; read [Accuracy](accuracy.md) first.",
         "",
     ]
     lines += _about(accuracy)

@@ -45,11 +45,11 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
         pictures = [
             ReportFigure(
                 "environment-errors",
-                "Error of whole episodes (the first 1,000 steps of longer ones), relative to the size of the "
-                "state, as the largest up to a time. "
-                "One line per episode, and for CartPole-v1 another for its update carried on past its end. "
-                "The exact states are computed to more than 30 digits. Dotted, in the same colours: one "
-                "rounding of the start, propagated in exact arithmetic.",
+                "Error of whole episodes (the first 1,000 steps of longer ones), relative to the size of "
+                "the state, as the largest up to a time. There is one line per episode, and for "
+                "CartPole-v1 a second line for its update continued past the end. The exact states are "
+                "computed to more than 30 digits. Dotted, in the same colours: one rounding of the start, "
+                "propagated in exact arithmetic.",
                 lambda: _draw_all(episodes),
             ),
             ReportFigure(
@@ -75,27 +75,28 @@ def _text() -> list[str]:
         "Episodes are recorded from gym.make under random actions: float64 states, and the controls that "
         "were applied. The exact motion has the same start and the same controls, without rounding in "
         f"between. The oracle computes it with {DIGITS} digits, and for the first seed of lag_envs's own "
-        f"again with {DIGITS + 12}. Where a task has random kicks, they are computed by its own formula from "
-        "the environment's own random numbers, without rounding.",
-        "Gymnasium's equations are those of scenes with the parameters of each instance. Its environments "
-        "clip velocities: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 "
-        "wraps are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, since its "
-        "actions are float32; that counts as its error. CartPole-v1 falls within a second under random "
-        "actions, so "
-        "its update is also continued past that end, to 10 s.",
-        "An error is the largest over the entries of the state and over the time until then, each entry "
-        "relative to its largest size in the episode, at least 1 in SI units. No method that starts "
-        "from float64 numbers can do better than about one rounding of the start, amplified by the system. "
-        "So this rounding floor is shown too: every entry of the start is moved by 2^-53 of its size, and "
-        "propagated exactly. Where the system damps or does not amplify, roundings of later steps add to it.",
-        "The exact flows of pendulum and linear motion have a truncation error below rounding. A step of the "
-        "general series is divided until the truncation error of each part, as its certificate says, is less "
-        f"than {TOLERANCE:g} of a velocity's size, and no further. Where steps are long, or friction changes "
-        "within a narrow range of speeds, it comes close to that limit, which is many roundings.",
-        "The error of one step is the largest of any step of the episode. Each step is repeated in exact "
-        "arithmetic from the state recorded before it, and compared with the state recorded after it. "
-        "lag_envs carries cosine and sine beside the angle. If an angle has grown to many turns, its "
-        "rounding differs from that of the pair, and this counts as error too.",
+        f"again with {DIGITS + 12}. If a task has random kicks, they are computed by the task's own formula "
+        "from the environment's own random numbers, without rounding.",
+        "Gymnasium's environments have the equations of scenes with the parameters of each instance. They "
+        "clip velocities; episodes in which this happens are left out, and the next seed is taken. Angles "
+        "that Acrobot-v1 wraps are compared up to whole turns. Pendulum-v1 rounds the torque's part to "
+        "float32, since its actions are float32; this rounding counts as error. CartPole-v1 falls within a "
+        "second under random actions, so its update is also continued past that end, to 10 s.",
+        "The error at a time is the largest over the entries of the state and over all times until then. "
+        "Each entry is relative to its largest size in the episode, or to 1 in SI units if that is larger. "
+        "No method that starts from float64 numbers can do better than about one rounding of the start, "
+        "amplified by the system. This rounding floor is shown too: every entry of the start is moved by "
+        "2^-53 of its size, and the motion is propagated exactly. If the system damps or does not amplify, "
+        "roundings of later steps add to this floor.",
+        "The exact flows of pendulum and linear motion have a truncation error below rounding. A step of "
+        "the general series is divided until the truncation error of each part, as its certificate says, "
+        f"is less than {TOLERANCE:g} of a velocity's size, and no further. If steps are long, or if "
+        "friction changes within a narrow range of speeds, the error comes close to that limit, which is "
+        "many roundings.",
+        "The error of one step is the largest error of any step of the episode. Each step is repeated in "
+        "exact arithmetic from the state recorded before it, and compared with the state recorded after "
+        "it. lag_envs carries cosine and sine beside the angle. If an angle has grown to many turns, its "
+        "rounding differs from that of the pair, and this difference counts as error too.",
     ]
 
 
@@ -164,8 +165,8 @@ def _entries_table(cases: dict[str, list[Row]]) -> Table:
             lines.append([case, entry["name"], entry["unit"], size, *errors])
     return Table(
         "environment-entries",
-        "Errors of each entry of the state in its unit, the largest over the episodes. Size: the largest "
-        "that the entry reaches, at least 1.",
+        "Errors of each entry of the state in its unit: the largest over the episodes. Size: the largest "
+        "value that the entry reaches, at least 1.",
         ["environment", "entry", "unit", "size", *map(_column, MARKS)],
         lines,
     )
@@ -181,9 +182,9 @@ def _free_table(free: list[Row]) -> Table:
         "environment-undriven",
         f"A pendulum without control, released at rest {RELEASED} rad from hanging: the error of its angle, "
         f"and how much its energy above rest, which should be constant, grows in {LONG:g} s. The lag_envs "
-        "pendulum has the equation of motion of Pendulum-v1. A step of 0.05 s is 2.5 times the one that its "
-        "series is designed for, so the error is truncation within the 1e-12 rad/s allowed per step; with "
-        "0.02 s only rounding is left. CartPole-v1 is given no force.",
+        "pendulum has the equation of motion of Pendulum-v1. A step of 0.05 s is 2.5 times as long as the "
+        "step that its series is designed for, so the error is truncation within the 1e-12 rad/s allowed "
+        "per step; at 0.02 s only rounding is left. CartPole-v1 is given no force.",
         [
             *("case", "integrator", "dt [s]", "angle, one step [rad]", "up to 1 s [rad]"),
             *("up to 10 s [rad]", "amplified rounding", "error over amplified rounding"),
@@ -208,9 +209,9 @@ def _details(rows: list[Row]) -> Table:
 def _summary(episodes: dict[str, list[Row]]) -> Table | None:
     table = Table.of(
         "environments",
-        "Error against the exact motion under the same controls, relative to the size of the state; the "
-        "largest over random episodes. One step: the largest over all of their steps. Last column: the "
-        "error over one rounding of the start as amplified by the system.",
+        "Error against the exact motion under the same controls, relative to the size of the state: the "
+        "largest over random episodes. One step: the largest over all their steps. Last column: the error "
+        "divided by one rounding of the start, as amplified by the system.",
         {
             "environment": lambda group: group[0]["case"],
             "integrator": lambda group: group[0]["integrator"],

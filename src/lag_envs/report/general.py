@@ -309,7 +309,7 @@ def _heyoka(system: System, mode: str) -> float:
     problems = SceneProblems(system.scene, *system.draw(1), system)
     width = 1 if mode == "single" else 2 * heyoka.recommended_simd_size()
     state: Any = heyoka.llvm_state
-    # Earlier compilations, also those of other processes, must not count; version 7 keeps them on disk too.
+    # Earlier compilations, today's or older, must not be reused; version 7 keeps them on disk too.
     state.clear_memcache()
     switch = getattr(state, "set_diskcache_enabled", lambda on: None)
     switch(False)

@@ -181,11 +181,11 @@ TEXT = (
     "A constant that is zero costs no operation, and the state has no entries that an environment "
     "does not need. Terms are those of θ'' = -α sinθ - β cosθ - γθ' + δ + ramp·t for bar and shell, of "
     "x'' = pull - drag·x' for a fixed slope, and of the linear equation of a turning slope.",
-    "Unused are inputs of an id's compiled step on which no result depends: its lines are followed "
-    "backwards from the next state, reward, ending and observation to constants, state, target and "
-    "action. Idle are operations whose result is not used.",
-    "Savings: a control step of 1,024 states at once, dynamics only, compiled without a feature and with "
-    "it. Both are timed in turn; the numbers are medians.",
+    "Unused inputs of an id's compiled step are those on which no result depends. To find them, the step's "
+    "lines are followed backwards from the next state, reward, ending and observation to constants, state, "
+    "target and action. Idle operations are those whose result is not used.",
+    "Savings: a control step of 1,024 states at once, dynamics only, compiled without and with a feature. "
+    "Both versions are timed in turn; the numbers are medians.",
 )
 
 

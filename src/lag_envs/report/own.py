@@ -62,7 +62,7 @@ class Subject(NamedTuple):
     task: type[Any] | None = None
 
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
-        """Return states of episodes under random actions (without a task, random states), and random controls."""
+        """Return states of random episodes, or random states if there is no task, and random controls."""
         rng = np.random.default_rng(seed)
         low, high = (np.array([box[i] for box in self.controls]) for i in (0, 1))
         controls = rng.uniform(low, high, (count, len(self.controls)))

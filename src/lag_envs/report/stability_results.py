@@ -45,15 +45,15 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
     return Content(
         "Stiff and extreme cases",
         [
-            "Each cell of a map is one control step from one start with the control held, once with our step "
-            "and once with each comparison integrator, which takes it in one step (or in 16, if "
-            "stated). The error is the largest of the state's entries, each relative to its scale: "
-            "max(1, |q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged means "
-            f"a result that is not finite or an error above {FAR_OFF:g} times the scale. The reference has "
-            "30 digits; if that is not enough, the cell says so.",
-            "Maps in float32 run the same formulas on float32 numbers. lag_envs then takes the substeps that "
-            f"the bound requires, up to {MOST_SUBSTEPS:,}. The jump along the slow manifold, which avoids "
-            "most of them under heavy damping, exists in float64 only.",
+            "Each cell of a map is one control step from one start with the control held, once with our "
+            "step and once with each comparison integrator, which covers it in one step (or in 16, if "
+            "stated). The error is the largest over the state's entries, each relative to its scale: "
+            "max(1, |q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged "
+            f"means a result that is not finite or an error above {FAR_OFF:g} times the scale. The "
+            "reference has 30 digits; if that is not enough, the cell says so.",
+            "Maps in float32 run the same formulas on float32 numbers. lag_envs then takes the substeps "
+            f"that the bound requires, up to {MOST_SUBSTEPS:,}. The jump along the slow manifold, which "
+            "avoids most substeps under heavy damping, exists only in float64.",
             "A named case should have full accuracy, be accurate up to the rounding floor, or be refused "
             f"with an error. Full accuracy means an error of at most {EXACT:g} times the scale in every "
             "entry. If the system itself amplifies a rounding of its start so much that no method can reach "
@@ -110,9 +110,9 @@ def _verdicts(found: Sequence[Row]) -> Table | None:
         lines.append([*cells, *(row.get(key) for key in MEASURED), verdict])
     return Table(
         "extreme-cases",
-        "Every stiff and extreme case. Error: relative to the scale. Amplification: the effect of one "
-        "rounding of the start at the end, over 2^-53 times the scale. Roundings: the error over the "
-        "effect of one rounding of the start, or of the end if that is larger.",
+        "Every stiff and extreme case. Error: relative to the scale. Amplification: the effect at the end "
+        "of one rounding of the start, divided by 2^-53 times the scale. Roundings: the error divided by "
+        "the effect of one rounding of the start, or of the end if that is larger.",
         ["case", "scene", "dt [s]", "expected", "came out", *MEASURED, "verdict"],
         lines,
     )
@@ -215,8 +215,8 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
                 ReportFigure(
                     f"stability-{map}-{_slug(name)}{n.replace(', ', '-')}",
                     f"{name}: error of one control step over {MAPS[map].label} and the step; comparison "
-                    f"integrators {times}. Beside each map the same in float32. Start {STARTS[name][0]}. "
-                    "Reference: 30 digits.",
+                    f"integrators {times}. Each map is shown next to the same map in float32. Start "
+                    f"{STARTS[name][0]}. Reference: 30 digits.",
                     partial(_draw_map, rows, MAPS[map].label, n),
                     raster=True,
                 )
@@ -226,8 +226,9 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
         pictures.append(
             ReportFigure(
                 "extreme-cases-map",
-                "The named cases: log10 of the error of one control step, lag_envs beside the comparison "
-                "integrators in one step and in 16. Cases that should be refused are in the table only.",
+                "The named cases: log10 of the error of one control step, lag_envs and the comparison "
+                "integrators, the latter in one step and in 16. Cases that should be refused are in the "
+                "table only.",
                 lambda: _draw_cases(measured),
                 raster=True,
             )

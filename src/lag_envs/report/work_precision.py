@@ -73,7 +73,7 @@ SAMPLE = 0.02
 
 
 def control_step(variant: str) -> float:
-    """Return the control step [s], rounded to a multiple of 2^-36 to make its products with integers exact."""
+    """Return the control step [s], rounded to a multiple of 2^-36: products with integers are exact."""
     return round(VARIANTS[variant].dt * 2**36) / 2**36
 
 

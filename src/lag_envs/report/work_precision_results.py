@@ -119,30 +119,32 @@ def _text(rows: Sequence[Row]) -> list[str]:
     members = f" (from {min(sizes)} to {max(sizes)} of them)" if len(sizes) > 1 else ""
     return [
         f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and "
-        "over the entries of the state. Each is relative to its size, as docs/numerics.md defines accuracy; "
-        "over 10 s and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms "
-        "where there is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and "
-        "drive), else Taylor series in fixed-point arithmetic. The control is held over the whole time. Over "
-        "1,000 s there is no control, and pendulums have no damping.",
+        "over the entries of the state. Each error is relative to the size of its entry, as "
+        "docs/numerics.md defines accuracy; over 10 s and 1,000 s it is relative to the size at the end. "
+        "The reference is exact to 30 digits: a closed form if there is one (linear scenes; Jacobi's "
+        "elliptic functions for a pendulum without damping and drive), otherwise Taylor series in "
+        "fixed-point arithmetic. The control is held over the whole time. Over 1,000 s there is no "
+        "control, and pendulums have no damping.",
         "lag_envs is timed as shipped: each scene's own order and tolerance, control step by control step. "
         "Over 10 s and 1,000 s there are also steps of half to eight times that length, and a single step "
-        "that `simulate` divides ('lag_envs, one call'). The time includes the test whether a step is "
+        "that `simulate` divides ('lag_envs, one call'). The time includes testing whether a step is "
         "certified.",
         "Every rival gets the scene's own equation in its fastest form, and errors are those of the calls "
         "that are timed. The usual integrators are compiled by the same compiler at the same vector width "
-        "as lag_envs, with precomputed coefficients. 'Carried' ones have cosine and sine as unknowns, or "
-        "rotate them by short polynomials, and call no function. When a control is held for long they also "
-        "take one step for several control steps. heyoka runs with fast_math: single steps are its own "
-        "machine code called from a compiled loop, longer times one call of propagate_until, and a batch "
-        "goes in blocks of twice the recommended width. SciPy's compiled dopri5, dop853 and lsoda have a "
-        "compiled right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is compiled as a "
-        "whole, as a loop over states or a map. torchdiffeq has a batch as one tensor. MuJoCo runs in its "
-        "compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no batch, so "
-        "they take one state after the other. Anything that would take longer than some seconds is not "
-        "run.",
+        "as lag_envs, with precomputed coefficients. 'Carried' methods have cosine and sine as unknowns, "
+        "or rotate them by short polynomials, and call no function. If a control is held for long, these "
+        "integrators also take one step for several control steps. heyoka runs with fast_math: single "
+        "steps are calls of its own machine code from a compiled loop, longer times are one call of "
+        "propagate_until, and a batch is stepped in blocks of twice the recommended width. SciPy's "
+        "compiled dopri5, dop853 and lsoda have a compiled right-hand side, and a batch is one system; "
+        "Radau is that of solve_ivp. diffrax is compiled as a whole, as a loop over states or a map. In "
+        "torchdiffeq a batch is one tensor. MuJoCo runs in its compiled rollouts without contacts and "
+        "constraints. SciPy's Radau and MuJoCo have no batch, so they take one state after the other. "
+        "Anything that would take more than a few seconds is not run.",
         "Times are those of one control step. Everything in a job is timed in turn with lag_envs, and the "
-        "median is taken. Jobs are brought to one scale by the time of lag_envs in each. Over 10 s or 1,000 "
-        "s, slow methods are timed over only part of that, also in one call.",
+        "median is taken. The times of different jobs are made comparable by the time of lag_envs in each "
+        "job. Over 10 s or 1,000 s, slow methods are timed over only a part of that time, also in one "
+        "call.",
     ]
 
 
@@ -176,9 +178,9 @@ def _finding(found: Sequence[Duel]) -> str:
             f"{' to '.join(dict.fromkeys(ratios))} times as long"
         )
     for words, some in (
-        ("nobody else gets there", [d for d in found if d.own and not d.rival]),
-        ("lag_envs does not get there and a rival does", [d for d in found if d.rival and not d.own]),
-        ("nobody gets there", [d for d in found if not d.rival and not d.own]),
+        ("no other method reaches the error", [d for d in found if d.own and not d.rival]),
+        ("lag_envs does not reach the error and a rival does", [d for d in found if d.rival and not d.own]),
+        ("no method reaches the error", [d for d in found if not d.rival and not d.own]),
     ):
         if some:
             parts.append(f"{words} in {len(some)} ({', '.join(d.where for d in some)})")
@@ -191,8 +193,8 @@ def _finding(found: Sequence[Duel]) -> str:
 def _targets(found: Sequence[Duel]) -> Table:
     return Table(
         "work_precision_targets",
-        "The fastest form of lag_envs and of all others that reaches an error; below 1 the other is "
-        "faster. Empty cell: not reached.",
+        "The fastest form of lag_envs, and of all other methods, that reaches an error; below 1 the other "
+        "method is faster. Empty cell: not reached.",
         [
             "scene", "horizon", "mode", "error", "lag_envs", "lag_envs: error", "lag_envs: ns",
             "fastest other", "other: error", "other: ns", "other / lag_envs",
@@ -312,7 +314,7 @@ def _left(rows: Sequence[Row]) -> Table:
             found.append([row["variant"], row["horizon"], MODES[row["mode"]], _setting(row), problem])
     return Table(
         "work_precision_left",
-        "Not run, or diverged: members that ended without a number or further away than their own size. "
+        "Not run, or diverged: members whose end is not a number, or is farther off than their own size. "
         "They are drawn at the upper edge. Finer settings of methods that would take too long are not run "
         "either.",
         ["scene", "horizon", "mode", "method", "problem"],
@@ -398,7 +400,7 @@ def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
     elif ratios:
         evidence += f"the fastest rivals take {min(ratios):.2g} to {max(ratios):.2g} × our time"
     else:
-        evidence += "nobody else gets there"
+        evidence += "no other method reaches the error"
     return _claim(
         f"{horizon.capitalize()}: nobody reaches an error of {target:.0e} in less time than lag_envs as "
         "shipped, alone or in a batch",
