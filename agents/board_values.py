@@ -67,7 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "examples:\n  python -m agents.board_values\n  python -m agents.board_values PivotedBar-v0",
     )
     parser.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
-    parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")
+    parser.add_argument(
+        "--board",
+        type=Path,
+        default=Path("leaderboard"),
+        help="folder of the leaderboard (default %(default)s)",
+    )
     args = parser.parse_args(arguments)
     solved = [env_id for env_id, task in TASKS.items() if task.value_iteration]
     envs = [check_env(name) for name in args.env] or solved

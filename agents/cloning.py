@@ -41,7 +41,7 @@ class Settings(LearnerSettings):
     n_steps: Count = Field(description="steps of each environment between updates")
     n_updates: int = Field(ge=1, description="minibatches of an update")
     batch_size: int = Field(ge=1, description="steps of a minibatch, drawn from all collected data")
-    learning_rate: float = Field(ge=0, description="of Adam at the start; it falls linearly to 0")
+    learning_rate: float = Field(ge=0, description="Adam's step size at the start; falls linearly to 0")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layer's weights at the start")
 

@@ -43,7 +43,7 @@ from lag_envs.tasks.registration import make_task
 EPISODES = 20
 EPILOG = """files in the output folder:
   model.zip            the policy; agents.learners.load_policy takes the folder
-  learning_curve.png   returns while training, beside the controllers and the random policy
+  learning_curve.png   returns during training, with those of the controllers and the random policy
   episode.mp4          one fresh episode of the trained policy
   comparison.json      returns and scores of all agents on the same fresh episodes
   result.json          the training: returns, learning curve, hyperparameters, versions and times
@@ -73,7 +73,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, default=0, help="seed of training (default %(default)s)")
     p.add_argument("--steps", type=int, help="environment steps to train for, in total")
     p.add_argument(
-        "--output", type=new_folder, default="runs/demo", metavar="FOLDER", help="default %(default)s"
+        "--output",
+        type=new_folder,
+        default="runs/demo",
+        metavar="FOLDER",
+        help="where to write (default %(default)s)",
     )
     p.add_argument("--new", action="store_true", help="start over, overwriting the run in the output folder")
     p.add_argument("--no-video", action="store_true", help="make no video")

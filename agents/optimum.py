@@ -56,7 +56,7 @@ grid, and goes backwards from the end of the episode. It runs on several grids, 
 before.
 
 what is written:
-  agents/results/optimum/ID.json   numbers: bounds from below and from above, and how they were found
+  agents/results/optimum/ID.json   lower and upper bounds, and how they were found
   docs/images/value-ID.png         the value function at the start, where the best action changes sign
   FOLDER/ID/.../values.npy         all V_t, up to 1 GB each, 12 GB for all ids; may be deleted at any time
 
@@ -76,7 +76,7 @@ For a task with plans (`Task.plans`), plans are found instead, by iLQR from rand
   src/lag_envs/controllers/plans/ID-quick.npz
                 a quicker plan, from which each episode is replanned
   src/lag_envs/tasks/measured.json
-                the returns of both, measured by python -m agents.scale: means over fresh starts with standard
+                the returns of both plans, by python -m agents.scale: means over fresh starts with standard
                 errors; the better one is the best known return, a lower bound
 With --quick, plans of one seed are written to FOLDER and nothing is measured.
 For a task with neither grid nor plans, python -m agents.scale measures the controllers and the best policy of

@@ -46,7 +46,7 @@ TESTS, EPISODES = 24, 100
 #: Heights of a small curve's characters, for scores from 0 to 1, and how many characters it has.
 HEIGHTS, WIDTH = "▁▂▃▄▅▆▇█", 16
 EPILOG = f"""Trainings run one after the other, each in its own process on one core: every learner with one
-seed, then every learner with the next. Other load on the machine so disturbs all learners alike. There are
+seed, then every learner with the next, so that other load disturbs all learners alike. There are
 two clocks. One counts only training; it stops during the {TESTS} tests on {EPISODES} episodes. The other
 counts the whole process: imports, compiling, training, and one evaluation. Processor time leaves out what
 other programs do.
@@ -89,8 +89,8 @@ def parser() -> argparse.ArgumentParser:
         "--learners", nargs="+", default=["fast_ppo", "ppo"], metavar="NAME",
         help=f"of {', '.join(LEARNERS)} (default fast_ppo ppo)",
     )  # fmt: skip
-    p.add_argument("--seeds", type=int, default=5, metavar="N", help="default %(default)s")
-    p.add_argument("--first-seed", type=int, default=0, metavar="K", help="default %(default)s")
+    p.add_argument("--seeds", type=int, default=5, metavar="N", help="number of seeds (default %(default)s)")
+    p.add_argument("--first-seed", type=int, default=0, metavar="K", help="first seed (default %(default)s)")
     p.add_argument("--steps", type=int, metavar="N", help="steps of each training (default: the task's own)")
     p.add_argument("--output", type=new_file, metavar="FILE", help="keep trainings as lines of JSON; resumes")
     p.add_argument("--picture", type=new_picture, metavar="FILE", help="draw scores against time and steps")

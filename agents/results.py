@@ -53,11 +53,22 @@ def parser() -> argparse.ArgumentParser:
     p = module_parser("agents.results", "Measure all agents, and write results, figures and page.", EPILOG)
     p.add_argument("--envs", nargs="+", metavar="ENV", help="environments to measure (default: all)")
     p.add_argument("--agents", nargs="+", metavar="NAME", help="agents to measure (default: all)")
-    p.add_argument("--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="default runs/")
     p.add_argument(
-        "--output", type=Path, metavar="FOLDER", help="default: this clone; with --quick, RUNS/quick"
+        "--runs",
+        type=Path,
+        default=ROOT / "runs",
+        metavar="FOLDER",
+        help="folder of learners' runs (default runs/)",
     )
-    p.add_argument("--episodes", type=int, metavar="N", help=f"under each condition (default {EPISODES})")
+    p.add_argument(
+        "--output",
+        type=Path,
+        metavar="FOLDER",
+        help="where to write (default: this clone; with --quick, RUNS/quick)",
+    )
+    p.add_argument(
+        "--episodes", type=int, metavar="N", help=f"episodes under each condition (default {EPISODES})"
+    )
     p.add_argument(
         "--changed",
         type=int,

@@ -162,11 +162,21 @@ def folder_part(name: str) -> str:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     p = module_parser("agents.submit", "Make leaderboard submissions of all our agents.", HELP)
-    p.add_argument("out", metavar="OUT", type=Path, help="where to")
+    p.add_argument("out", metavar="OUT", type=Path, help="folder for the submissions")
     p.add_argument("--envs", nargs="+", metavar="ENV", help="environments (default: all)")
-    p.add_argument("--runs", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
     p.add_argument(
-        "--optimum", type=Path, default=DEFAULT_FOLDER, metavar="FOLDER", help="default %(default)s"
+        "--runs",
+        type=Path,
+        default=Path("runs"),
+        metavar="FOLDER",
+        help="folder of learners' runs (default runs/)",
+    )
+    p.add_argument(
+        "--optimum",
+        type=Path,
+        default=DEFAULT_FOLDER,
+        metavar="FOLDER",
+        help="folder of value functions (default %(default)s)",
     )
     p.add_argument("--new", action="store_true", help="make existing submissions again")
     return p

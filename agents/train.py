@@ -112,7 +112,13 @@ def add_run_options(p: argparse.ArgumentParser) -> None:
         "--steps", type=int,
         help="environment steps per seed, in place of n_timesteps; rounded up to whole updates",
     )  # fmt: skip
-    p.add_argument("--output", type=new_folder, default="runs", metavar="FOLDER", help="default %(default)s")
+    p.add_argument(
+        "--output",
+        type=new_folder,
+        default="runs",
+        metavar="FOLDER",
+        help="where to write (default %(default)s)",
+    )
     p.add_argument("--new", action="store_true", help="start over, overwriting earlier runs of these seeds")
 
 

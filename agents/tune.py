@@ -225,12 +225,17 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("env", metavar="ENV", help="id of an environment")
     p.add_argument("--only", metavar="NAME", help="tune this controller only")
     p.add_argument("--episodes", type=int, help="episodes per trial (default 2000, with --settings 200)")
-    p.add_argument("--generations", type=int, help="default 15")
+    p.add_argument("--generations", type=int, help="generations of differential evolution (default 15)")
     p.add_argument("--settings", type=int, metavar="N", help=f"try this many settings of {LEARNER} instead")
     p.add_argument("--steps", type=int, help="steps of each training (default: the task's own)")
     p.add_argument("--seeds", type=int, help="trainings with each setting (default 2)")
     p.add_argument("--jobs", type=int, help="trainings at once (default 1)")
-    p.add_argument("--output", type=new_file, metavar="FILE", help="default agents/results/tuning/ENV.json")
+    p.add_argument(
+        "--output",
+        type=new_file,
+        metavar="FILE",
+        help="where to write (default agents/results/tuning/ENV.json)",
+    )
     return p
 
 

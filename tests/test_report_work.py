@@ -402,7 +402,8 @@ def assert_sentences_agree(text, columns, rows):
             if won:
                 assert re.search(rf"takes {won[0]:.2g}( to {won[-1]:.2g})? times as long", sentence)
             for words, own, other in (
-                ("no other method reaches the error", True, False), ("no method reaches the error", False, False),
+                ("no other method reaches the error", True, False),
+                ("no method reaches the error", False, False),
                 ("lag_envs does not reach the error and a rival does", False, True),
             ):  # fmt: skip
                 count = sum(bool(r["lag_envs"]) == own and bool(r["fastest other"]) == other for r in here)

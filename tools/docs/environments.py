@@ -110,9 +110,9 @@ def index() -> str:
 Mean return ± standard error of random actions and of the best policy known, as measured by
 `python -m agents.scale`.
 
-Actions lie in [-1, 1] and are scaled to the control, or are choices; exact versions of Gymnasium's
-environments have Gymnasium's spaces. Observations are float32, the underlying state float64.
-[Usage](../usage.md#keywords-of-every-environment) has the keywords that all of them take.
+Actions lie in [-1, 1] and are scaled to the control, or they are choices; exact versions of Gymnasium's
+environments have Gymnasium's spaces. Observations are float32, the underlying state is float64.
+[Usage](../usage.md#keywords-of-every-environment) lists the keywords that all environments take.
 """
 
 
@@ -174,9 +174,10 @@ def _energy(env_id: str, task: Task) -> str:
     if not (ROOT / "docs" / "images" / f"energy-{env_id}.png").exists():
         return ""
     return (
-        f"![Energy less work against time in {task.peer} and {env_id}](../images/energy-{env_id}.png)\n\n"
-        "The energy minus the work that the control has done, under random actions from a start in mid-task. "
-        "There is no friction, so it must stay constant."
+        f"![Energy less work against time in {task.peer} and "
+        f"{env_id}](../images/energy-{env_id}.png)\n\nThe picture shows the energy minus the work done by "
+        "the control, under random actions from a start in mid-motion. There is no friction, so this "
+        "difference must stay constant."
     )
 
 
@@ -266,8 +267,8 @@ def arguments(task: Task) -> str:
     ]
     also = (
         'Also `render_mode` ("human" or "rgb_array"), and `diagnostics=True`, which puts controls, forces '
-        "and energy into `info`; and those of [imperfect sensors and actuators and hidden parameters]"
-        "(../usage.md#imperfect-sensors-and-actuators)"
+        "and energy into `info`; and the keywords of [imperfect sensors and actuators and hidden "
+        "parameters](../usage.md#imperfect-sensors-and-actuators)"
     )
     own = ", ".join(f"`{name}={value!r}`" for name, value in type(task).imperfections.items())
     also += f", of which {own} are on here." if own else "."
@@ -316,22 +317,24 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
         texts.append(
             f"Stepped by a Taylor series of order {order}. One series per step is certified to have a "
             f"truncation error of at most 1e-12 rad/s as long as |`{rate}`| is at most "
-            f"{math.floor(10.0 * speed) / 10.0:.1f} rad/s, whatever the control. Above that, the step is "
-            "divided by the same bound."
+            f"{math.floor(10.0 * speed) / 10.0:.1f} rad/s, whatever the control. Above this speed, the step "
+            "is divided into parts by the same bound."
         )
     if form_of(task.scene) is None:
         texts.append(
-            "Stepped by Taylor series. Each comes with a proved bound on its truncation error: at most "
-            f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. If that does not help, for "
-            "example with a link of a millimetre, an error names state and control, and the state is kept."
+            "Stepped by Taylor series, each with a proved bound on its truncation error. If the bound "
+            f"exceeds {TOLERANCE:.0e} of the velocities' size, the step is divided. If dividing does not "
+            "help, for example with a link of a millimetre, an error names state and control, and the "
+            "state is kept."
         )
     for row in _summary_rows(accuracy):
         if row["environment"] == env_id:
             texts.append(
                 "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
-                f"error of a single step is {row['one step']:.1e} of the state's size, that of an episode "
-                f"{row['whole episode']:.1e}, which is {number_text(row['error / rounding floor'])} times "
-                "one rounding of the start, as amplified by the system. See [Accuracy](../accuracy.md)."
+                f"error of a single step is {row['one step']:.1e} of the state's size. The largest error of "
+                f"an episode is {row['whole episode']:.1e}, which is "
+                f"{number_text(row['error / rounding floor'])} times one rounding of the start, as "
+                "amplified by the system. See [Accuracy](../accuracy.md)."
             )
     return "\n\n".join(texts)
 
@@ -404,14 +407,14 @@ def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
             for row in ranked
         ]
         texts += [
-            "The top of the leaderboard (0 is random actions, 1 the best policy known when the protocol "
-            "began):",
+            "The top of the leaderboard (score 0 is random actions, 1 the best policy known when the "
+            "protocol began):",
             markdown_table(["Rank", "Agent", "Kind", "Score", "95 % interval"], rows),
             f"[The board](../board/{env_id}.html) has the whole ranking. "
             f"[Agents](../agents.md#{env_id.lower()}) has their robustness and learning curves.",
         ]
     elif task.goal:
-        texts.append(f"Nobody is on [its board](../board/{env_id}.html) yet.")
+        texts.append(f"[Its board](../board/{env_id}.html) has no entries yet.")
     return "\n\n".join(texts)
 
 

@@ -20,8 +20,8 @@ def scenes_page() -> str:
         "# Scenes",
         "A scene states its kinetic and potential energy, its drag and its applied forces. Everything on "
         "this page follows from them: SymPy derives the formulas below from the same energies that are "
-        "stepped. [Physics](physics.md) says more about the first three, [the tutorial](tutorial.md) how "
-        "to write one.",
+        "stepped. [Physics](physics.md) says more about the first three scenes, and [the "
+        "tutorial](tutorial.md) shows how to write a scene.",
         markdown_table(["scene", "", "state", "control"], [_row(kind) for kind in SCENES]),
     ]
     for kind in SCENES:

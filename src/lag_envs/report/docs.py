@@ -213,8 +213,8 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     lines = [
         "# Accuracy",
         "",
-        "This page shows what was measured, how other methods compare, and where they are better. This "
-        "page is generated from the measurements of `lag-envs report`.",
+        "This page shows what was measured, how other methods compare, and where they are better. It is "
+        "generated from the measurements of `lag-envs report`.",
         "",
         "## Error against run time",
         "",
