@@ -83,8 +83,8 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "env", nargs="+", metavar="ENV",
-        help="ids, module:ID, or FILE or FILE:Class of your own, whose code is run; "
-        "all: those of the package whose actions suit the learner",
+        help="ids, module:ID, or your own FILE or FILE:Class, whose code is run; "
+        "all: the package's environments whose actions suit the learner",
     )  # fmt: skip
     p.add_argument(
         "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(LEARNERS)} (default ppo)"
