@@ -271,7 +271,7 @@ def test_all_agents_are_submitted(runs, tmp_path, monkeypatch, capsys):
     (tmp_path / "runs" / ENV / "sac" / "seed0" / "model.zip").write_bytes(b"")
     monkeypatch.chdir(tmp_path)
     assert main(["out", "--envs", ENV]) == 0
-    assert "left out, it has 1 finished" in capsys.readouterr().out
+    assert "left out: it has 1 finished" in capsys.readouterr().out
     found = {load(folder).name for folder in (tmp_path / "out").iterdir()}
     assert found == {*controllers(TASKS[ENV]), "PPO"}
     assert main(["out", "--envs", ENV]) == 0

@@ -136,7 +136,7 @@ def test_a_disk_without_room_is_named_before_the_work(tmp_path):
         (["--seeds", "0"], "--seeds must lie between 1"),
         (
             ["--seeds", "2", "--first-seed", "999"],
-            "must lie below 1000, for each to have episodes of its own",
+            "must lie below 1000, so that no two share an episode",
         ),
         (
             ["--learners", "fast_ppo", "dqn"],

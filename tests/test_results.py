@@ -252,7 +252,7 @@ def test_command_that_is_broken_off(error, status, message, command, tmp_path, m
 def test_command_says_what_is_wrong(command, tmp_path):
     for arguments, message in (
         (["--envs", "PivotedBra-v0"], "did you mean PivotedBar-v0"),
-        (["--envs", ENV, "--agents", "ppo"], "no agent 'ppo' here; available: zero"),
+        (["--envs", ENV, "--agents", "ppo"], "no agent 'ppo'; available: zero"),
         (["--envs", ENV, "--episodes", "0"], "--episodes must lie between"),
         (["--redraw"], "measure first"),
     ):

@@ -459,7 +459,7 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
         ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, for each to have episodes"),
-        ([ENV, "--seeds", "1001"], "episodes of its own; got up to 1000"),
+        ([ENV, "--seeds", "1001"], "no two share an episode; got up to 1000"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
         ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac needs continuous actions; CartPole"),
         (
@@ -650,7 +650,7 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["nowhere.py"], "there is no file nowhere.py"),
         (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
-        ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
+        ([str(BALL), "--ray", "local"], "a file does not exist on the other machines"),
         slow([f"{SEVERAL}:Switched", "--algo", "sac"], "continuous actions; OwnSwitched-v0 has discrete"),
         slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "needs one discrete action; OwnCrane-v0 has several"),
         slow([f"{SEVERAL}:Drift"], "OwnDrift-v0 has no control: there is nothing to learn"),
