@@ -59,7 +59,7 @@ def training_seeds(first: int, count: int) -> range:
     """Return `count` seeds of trainings, or raise a UserError if one would repeat another's episodes."""
     if first + count > SEEDS:
         raise UserError(
-            f"seeds of trainings must lie below {SEEDS}, so that no two share an episode; got up to  "
+            f"seeds of trainings must lie below {SEEDS}, so that no two share an episode; got up to "
             f"{first + count - 1}"
         )
     return range(first, first + count)
@@ -166,7 +166,7 @@ class Run:
         self.check_settings(content, file)
         if not self.path(MODEL).exists():
             raise UserError(
-                f"{file} exists without {MODEL}; remove it to train again, or start over with --new"
+                f"{file} exists, but no {MODEL}; remove it to train again, or start over with --new"
             )
         return content
 

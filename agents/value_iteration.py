@@ -422,7 +422,7 @@ class ValueCache:
         except OSError as error:
             file.unlink(missing_ok=True)
             raise CacheError(
-                f"{file} cannot be written: it takes {size / 1e6:,.0f} MB ({error}); make room, or choose  "
+                f"{file} cannot be written: it takes {size / 1e6:,.0f} MB ({error}); make room, or choose "
                 "another --folder"
             ) from error
         self.record(self.done, 0.0)

@@ -200,7 +200,7 @@ def test_learners_refuse_what_they_do_not_know(tmp_path):
     file = tmp_path / "bad.yml"
     for text, message in (
         ("a: [", "cannot be read"),
-        ("[1, 2]", "map ids to hyperparameters, it is a list; `lag-envs hyperparams ppo` prints"),
+        ("[1, 2]", "map ids to hyperparameters, got a list; `lag-envs hyperparams ppo` prints"),
         ("a: 1", f"no entry for {ENV}, only for a"),
         (f"{ENV}: 3", f"bad.yml: the entry for {ENV} must map names to values, got 3"),
         (f"{ENV}: {{}}", f"bad.yml, entry {ENV}: n_timesteps is missing"),
@@ -458,7 +458,7 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--algo", "sacc"], "did you mean sac"),
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
-        ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, for each to have episodes"),
+        ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, so that no two share"),
         ([ENV, "--seeds", "1001"], "no two share an episode; got up to 1000"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
         ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac needs continuous actions; CartPole"),
