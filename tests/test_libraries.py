@@ -53,8 +53,8 @@ def test_a_run_with_another_id(home):
         ({"commands": "false; python train.py"}, "exit status 1"),
         ({"expect": ["done"]}, "lacks 'done'"),
         ({"leaves": ["*.zip"]}, r"no \*.zip"),
-        ({"replace": [["Acrobot-v1", "x"]]}, "stands in 0"),
-        ({"replace": [["s", "x"]]}, "stands in 4"),
+        ({"replace": [["Acrobot-v1", "x"]]}, "occurs 0 times"),
+        ({"replace": [["s", "x"]]}, "occurs 4 times"),
         ({"commands": "sleep 60"}, "not done after 0.5 s"),
     ],
 )
