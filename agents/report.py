@@ -184,7 +184,7 @@ def _times(env: Data) -> list[str]:
 
 
 def labelled(name: str, agent: Data) -> str:
-    """Return an agent's name; a learner's is followed by its seeds and steps.
+    """Return an agent's name; a learner's name is followed by its seeds and steps.
 
     Examples
     --------
@@ -198,7 +198,7 @@ def labelled(name: str, agent: Data) -> str:
 
 
 def brief(name: str, agent: Data) -> str:
-    """Return an agent's name for figures; a learner's is followed by its seeds and thousands of steps.
+    """Return an agent's name for figures, followed by a learner's seeds and thousands of steps.
 
     Examples
     --------
@@ -310,8 +310,8 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
     if not rows:
         return "In every pair, all runs of one agent are better than all runs of the other."
     text = (
-        f"Probabilities other than 0 and 1, with {100 * LEVEL:g} % intervals. Of two learners, the first is"
-        " the one that is more likely to be better."
+        f"Probabilities other than 0 and 1, with {100 * LEVEL:g} % intervals. Of two learners, the one"
+        " that is more likely to be better comes first."
     )
     return text + "\n\n" + markdown_table(["environment", "learner", "better than", "probability"], rows)
 

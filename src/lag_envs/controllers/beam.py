@@ -83,7 +83,7 @@ class BeamSearch:
     every : int, optional
         Steps after which a plan is renewed; by default it is followed to its end.
     pause : int
-        Smallest number of steps between a search and one that a surprise causes.
+        Smallest number of steps from a search to the next one that a surprise causes.
     surprise : float
         Deviation of an entry of the state from the plan that counts as a surprise.
 

@@ -37,7 +37,7 @@ def easier(
     share : float
         Largest acceleration, as a share of the task's.
     edge : float
-        Share of the track; a support that could not stop before this share under full braking is penalised.
+        A support that could not stop within this share of the track, braking fully, is penalised.
     """
     kind: Any = type(task)
 

@@ -47,9 +47,9 @@ class Filtered:
     controller : controller
         Acts on observations computed from the estimate.
     drift : float
-        Standard deviation added to the estimate's in each step, as a share of the state's spread at the
+        Standard deviation that is added to the estimate in each step, as a share of the state's spread at the
         start. It stands for everything that disturbs the motion, such as kicks, pushes and action noise.
-        Without it, an overconfident filter would ignore observations.
+        Without drift, the filter would be overconfident and ignore observations.
 
     Raises
     ------

@@ -46,7 +46,7 @@ class TiltCascade(FeedbackController):
     The regulator's u = -K (x - x*, w, φ) is the same as two loops in series: control of the place, φ_wanted =
     -(K_x (x - x*) + K_w w)/K_φ, then control of the tilt, u = K_φ (φ_wanted - φ). In this form, the wanted
     tilt can be limited to the plane's range. Far from the mark, the place loop asks for no more speed than
-    can be braked, because the error enters by its square root.
+    can be braked, because there the error enters by its square root.
 
     Parameters
     ----------

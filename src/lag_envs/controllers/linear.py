@@ -257,8 +257,8 @@ class Regulator(FeedbackController):
 class BalanceLQR(FeedbackController):
     """Keep bodies on a moving support upright by a linear-quadratic regulator, despite kicks.
 
-    The reward alone would make the regulator react as hard as possible; the added weights, found by ``python
-    -m agents.tune``, keep it ready for the next kick.
+    The reward alone would make the regulator react as hard as possible; the added weights keep it ready for
+    the next kick. They were found by ``python -m agents.tune``.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ class MPC:
     hold : Tracking, optional
         Feedback that continues a plan beyond its end, and that acts where `holds`.
     holds : callable, optional
-        Takes states (n, n_state) and returns booleans (n,): where no plan is needed.
+        Takes states (n, n_state) and returns booleans (n,), true where no plan is needed.
     seed : int
         Seed of the guesses. All episodes share the random numbers, so a plan may depend on the plans made
         before; a new agent starts over.

@@ -83,8 +83,8 @@ class EnergyShapingLQR:
     def swing(self, x: Array) -> Array:
         """Return the support's acceleration [m/s²] that brings the bar's energy to that of the upright rest.
 
-        The energy per moment of inertia is E = θ'²/2 - ω₀² cosθ, and u changes it in proportion to -u θ'
-        cosθ.
+        Per moment of inertia, the energy is E = θ'²/2 - ω₀² cosθ. The control u changes it in proportion to
+        -u θ' cosθ.
         """
         theta_dot, cosine = x[..., -1], np.cos(x[..., -2])
         missing = self.omega0_squared - (0.5 * theta_dot * theta_dot - self.omega0_squared * cosine)
