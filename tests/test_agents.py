@@ -92,7 +92,7 @@ def test_adapter_passes_options_and_infos_on():
             for name in a:
                 np.testing.assert_allclose(a[name], b[name], rtol=1e-12, atol=1e-12)
     adapter.set_options([{"state": [0.0, 0.0, 0.0, 0.0]}, {}, {}])
-    with pytest.raises(ValueError, match="all environments are given the same"):
+    with pytest.raises(ValueError, match="all environments must be given the same"):
         adapter.reset()
 
 

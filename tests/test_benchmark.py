@@ -132,14 +132,14 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--checkout", ".", incline.Tilt.id], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--threads", "0"], "a whole number of at least 1 is needed, got '0'"),
-        (["bench", "--threads", "10000"], "--threads 10000 needs as many cores; this process may use"),
+        (["bench", "--threads", "10000"], "--threads 10000 needs 10000 cores; this process may use"),
         (["bench", "--checkout", "nowhere"], f"{Path('nowhere/README.md')} is missing"),
         (["bench", "PivotedBar-v0", "--with", "wind=1"], "--with wind=1: got an unexpected keyword"),
         (["fly"], "there is no command 'fly'; did you mean play?"),
         (["lst"], "there is no command 'lst'; did you mean list?"),
         (["list", "PivotedBar"], "usage: lag-envs list"),
         (["info", "no_module:Id-v0"], "No module named 'no_module'"),
-        (["info", "gymnasium:CartPole-v1"], "gymnasium:CartPole-v1 is no task of lag_envs"),
+        (["info", "gymnasium:CartPole-v1"], "gymnasium:CartPole-v1 is not a task of lag_envs"),
     ],
 )
 def test_mistakes_are_told_without_a_traceback(arguments, message, capsys):

@@ -171,7 +171,7 @@ def test_what_cannot_be_removed_is_told(place, monkeypatch, capsys):
     monkeypatch.setattr(cache, "_remove", lambda path: False)  # as in a folder that may only be read
     assert main(["cache", "--clear"]) == 1
     told = capsys.readouterr()
-    assert "0 files removed" in told.out and f"cannot be removed: 1, such as {place}" in told.err
+    assert "0 files removed" in told.out and f"1 could not be removed, such as {place}" in told.err
 
 
 def test_a_file_that_may_not_be_read(place):

@@ -266,7 +266,7 @@ def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
     assert alone.predict(observation)[0] == model.predict(observation, deterministic=True)[0]
     seen = envs.normalize_obs(observation)
     assert whole.predict(observation)[0] == model.predict(seen, deterministic=True)[0]
-    with pytest.raises(UserError, match=rf"observes \(5,\) numbers, {FREE} has 3"):
+    with pytest.raises(UserError, match=rf"observes \(5,\) numbers, but {FREE} has 3"):
         watch.load_agent(FREE, TASKS[FREE](), str(tmp_path / "model.zip"))
 
 

@@ -361,7 +361,7 @@ def test_without_a_gpu(capsys):
         (["--device", "cuda"], "--device: there is no device 'cuda' here"),
         (["--device", "cpu"], "--device must be cuda or cuda:N, got 'cpu'; leave it out for the processor"),
         (["--device", "cuda:x"], "--device: device must be 'cpu' or 'cuda', got 'cuda:x'"),
-        (["--device", "cuda", "--cold"], "--device does not go with --cold"),
+        (["--device", "cuda", "--cold"], "--device cannot be combined with --cold"),
         (["--device", "cuda", "--quick", "--checkout", "."], "leave out IDs, --quick, --sizes"),
         (["--device", "cuda", "--sizes", "1", "--checkout", "."], "leave out IDs, --quick, --sizes"),
     ):

@@ -153,14 +153,14 @@ def test_what_is_neither_an_id_nor_a_file(command, capsys, tmp_path):
     missing = str(tmp_path / "no.py")
     assert f"there is no file {missing}" in told(capsys, command, missing)
     if command != "report":
-        assert "a file of your own ends with .py" in told(capsys, command, "BallOnBeam")
+        assert "the name of your own file must end with .py" in told(capsys, command, "BallOnBeam")
         assert "did you mean PivotedBar-v0" in told(capsys, command, "PivotdBar-v0")
 
 
 def test_report_takes_no_id_for_a_folder(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("PivotedBr-v0", "ball_on_beam:BallOnBeam-v0"):
-        assert f"{name} is no FILE, and looks like an id" in told(capsys, "report", name, "--quick")
+        assert f"{name} is not a FILE, and looks like an id" in told(capsys, "report", name, "--quick")
     assert "there is no section ''" in told(capsys, "report", "--quick", "--sections", "")
     assert not any(tmp_path.iterdir())
 

@@ -106,7 +106,7 @@ def altered(field, value):
         (altered(4, "fff0000000000000"), "a finite number, got -inf"),
         (altered(5, "x"), "8 hexadecimal"),
         (altered(5, "00000000"), "another step"),
-        (altered(1, "x" * 300_000), "characters, at most"),
+        (altered(1, "x" * 300_000), "characters; at most"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_link_is_told(link, told, capsys):

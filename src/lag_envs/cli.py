@@ -34,15 +34,15 @@ EXAMPLES = """examples:
   lag-envs info PivotedBar-v0        describe one of them
   lag-envs play PivotedBar-v0        drive it yourself
   lag-envs watch PivotedBar-v0       watch an agent do it
-  lag-envs new my_scene.py           start one of your own
-  lag-envs bench --quick             compare their speed with others
-  lag-envs report --quick            compare their accuracy with others
-  lag-envs leaderboard list          see who is best at them
+  lag-envs new my_scene.py           start your own scene
+  lag-envs bench --quick             compare their speed with other libraries
+  lag-envs report --quick            compare their accuracy with other methods
+  lag-envs leaderboard list          see which agents are best
   lag-envs bench --help              more about one command"""
 
 
 def parser(command_name: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of the whole command; only the given subcommand's arguments are declared, if any."""
+    """Return the parser of the whole command; a given name limits the arguments to that subcommand's."""
     whole = argparse.ArgumentParser(
         prog="lag-envs",
         allow_abbrev=False,
@@ -56,7 +56,7 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
         description, _, examples = command.description.partition("\n\nexamples:")
         one = commands.add_parser(
             command.name,
-            allow_abbrev=False,  # a misspelt option shall not act as another
+            allow_abbrev=False,  # so that a misspelt option cannot pass for another
             help=command.help,
             description=description,
             epilog=examples and "examples:" + examples,
@@ -69,7 +69,7 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its status, see `run_shown`; it is 2 for a mistake in the command line."""
+    """Run the command and return its status, see `run_shown`; a mistake in the command line returns 2."""
     return run_shown("lag-envs", lambda: _run(sys.argv[1:] if arguments is None else arguments))
 
 

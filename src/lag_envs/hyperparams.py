@@ -1,6 +1,6 @@
-"""Hyperparameters of learners: of Stable-Baselines3's in the form of the RL Zoo, and of our own.
+"""Hyperparameters of learners: those of Stable-Baselines3, in the form of the RL Zoo, and our own.
 
-A task states its own deviations (`Task.hyperparameters`). Measured with these steps; see docs/agents.md.
+A task states its own deviations (`Task.hyperparameters`). docs/agents.md has the results.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ DISCRETISE = "gymnasium.wrappers.DiscretizeAction"
 OWN = ("fast_ppo", "shac", "cloning")
 #: Learners with a replay buffer. A task may state deviations for all of them, as "off_policy".
 OFF_POLICY = ("sac", "td3", "tqc")
-#: One update of 256 steps for 16 new ones, for speed. Noise is kept for some steps.
+#: For speed, there is one update with 256 steps for every 16 new steps. Noise is kept for some steps.
 _OFF_POLICY: Mapping[str, Any] = {
     "n_envs": 16,
     "n_timesteps": 1e5,
@@ -117,7 +117,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "critic": [64, 32],
         "first_layer_scale": 2.0,
     },
-    # By gradients through the environment (agents/shac.py).
+    # Learns from gradients through the environment (agents/shac.py).
     "shac": {
         "n_timesteps": 1e6,
         "n_envs": 64,

@@ -15,7 +15,7 @@ def module_parser(module: str, about: str | None, examples: str, **options: Any)
     """Return the parser of ``python -m MODULE``, whose help keeps the line breaks of its texts."""
     return argparse.ArgumentParser(
         prog=f"python -m {module}",
-        allow_abbrev=False,  # a misspelt option shall not act as another
+        allow_abbrev=False,  # so that a misspelt option cannot pass for another
         description=about,
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -31,7 +31,7 @@ def count(text: str) -> int:
 
 
 def new_file(text: str) -> Path:
-    """Return the file of an option, before hours of work are spent on what could not be written to it.
+    """Return the file of an option, checked before hours of work are spent on output for it.
 
     Raises
     ------
@@ -53,12 +53,12 @@ def new_file(text: str) -> Path:
 
 
 def new_folder(text: str) -> Path:
-    """Return the folder of an option, before hours of work are spent on what could not be written to it.
+    """Return the folder of an option, checked before hours of work are spent on output for it.
 
     Raises
     ------
     argparse.ArgumentTypeError
-        If it is none, or nothing can be written to it. Missing folders are made when files are written.
+        If the path is not a folder, or cannot be written to. Missing folders are made when files are written.
     """
     path = Path(text)
     if path.exists() and not path.is_dir():
@@ -68,12 +68,12 @@ def new_folder(text: str) -> Path:
 
 
 def _check_folder(text: str, folder: Path) -> None:
-    """Raise an error for an argument if nothing can be written into a folder, or the next one that exists."""
+    """Raise an error for an argument if its folder, or the nearest parent that exists, is not writable."""
     import tempfile
 
     there = next(place for place in (folder, *folder.parents) if place.exists())
     try:
-        # Permissions do not tell all: nobody makes a file in /proc.
+        # Permissions do not tell everything: nobody can create a file in /proc.
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:

@@ -18,7 +18,7 @@ from lag_envs.scores import in_words
 PAIRS = (("left", "right"), ("down", "up"), ("a", "d"), ("s", "w"))
 #: The gamepad's sticks for the same controls.
 STICKS = ("left stick sideways", "left stick up and down", "right stick sideways", "right stick up and down")
-#: A stick pushed less than this is at rest.
+#: A stick that is pushed less than this counts as at rest.
 DEAD = 0.12
 
 
@@ -40,9 +40,9 @@ def pressed_action(
     space : gym.Space
         The environment's actions: a Box, Discrete or MultiDiscrete.
     pressed : callable
-        Tells whether the key with a name is pressed.
+        Takes the name of a key and tells whether it is pressed.
     rest : sequence of float
-        Each number of the action without a key; for a discrete action its index.
+        Each number of the action when no key is pressed; for a discrete action, its index.
     sticks : sequence of float, optional
         Displacements of a gamepad's sticks, in [-1, 1], in the order of the pairs of keys.
     """
@@ -87,13 +87,13 @@ class Gamepad:
         try:
             axes = [self._pad.get_axis(i) for i in range(min(4, self._pad.get_numaxes()))]
         except pygame.error:
-            # It was unplugged before its event came.
+            # The gamepad was unplugged before its event arrived.
             self._find()
             return []
         return [axis if i % 2 == 0 else -axis for i, axis in enumerate(axes)]
 
     def _find(self) -> None:
-        """Take the first gamepad, and say so if it is another than before."""
+        """Take the first gamepad, and say so if it is not the same as before."""
         joystick, before = self._pygame.joystick, self._pad
         try:
             self._pad = joystick.Joystick(0) if joystick.get_count() else None
@@ -140,7 +140,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None, **option
     steps : int, optional
         End after this many steps.
     seed : int, optional
-        Seed of the starts.
+        Seed of the initial states.
     **options
         Keywords of the environment.
     """

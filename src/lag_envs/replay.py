@@ -31,7 +31,7 @@ from urllib.parse import unquote
 from lag_envs.errors import UserError, hint
 
 VERSION = 1
-#: An action in [-1, 1] is a multiple of one over this: exact in float32.
+#: Actions in [-1, 1] are multiples of one over this number, which float32 holds exactly.
 LEVELS = 64
 #: The longest link, and the longest drive that is recomputed.
 LONGEST, MOST_STEPS = 200_000, 100_000
@@ -74,11 +74,11 @@ class Replayed(NamedTuple):
     total : float
         Its return.
     true : bool
-        Whether it equals the claimed one, in every bit.
+        Whether it equals the claimed return in every bit.
     finished : bool
         Whether the episode ended with the last key; otherwise the driver stopped earlier.
     terminated : bool
-        Whether it terminated before the time limit.
+        Whether the episode terminated before the time limit.
     score : float or None
         On the board's scale, if the environment has one and the episode is finished. A part of an episode has
         no score: where rewards are costs, it would look too good.
@@ -116,7 +116,7 @@ def read_link(link: str) -> Drive:
         If it is not a link of a drive, or is damaged; the text says what is wrong.
     """
     if len(link) > LONGEST:
-        raise LinkError(f"the link has {len(link):,} characters, at most {LONGEST:,} are read")
+        raise LinkError(f"the link has {len(link):,} characters; at most {LONGEST:,} are read")
     link = unquote(link)  # some programs write ~ as %7E
     text = link.strip().rpartition(MARK)[2]
     fields = text.split("~")
@@ -125,7 +125,7 @@ def read_link(link: str) -> Drive:
             f"{_short(link)} is not a link to a drive: it must hold #{MARK} and what follows; copy all of it"
         )
     if fields[0] != str(VERSION):
-        raise LinkError(f"the link has version {_short(fields[0])}, this program reads version {VERSION}")
+        raise LinkError(f"the link has version {_short(fields[0])}, but this program reads version {VERSION}")
     if len(fields) != 7:
         raise LinkError(f"the link is damaged: it has {len(fields)} fields, not 7; copy all of it")
     before, _, check = text.rpartition("~")
@@ -146,7 +146,7 @@ def read_link(link: str) -> Drive:
     if not re.fullmatch(r"[A-Za-z0-9_-]*", keys):
         raise LinkError("the link's keys hold characters that base64url does not have")
     if not keys:
-        raise LinkError("the link's drive has no step")
+        raise LinkError("the link's drive has no steps")
     return Drive(id, int(seed), keys, total, step)
 
 
@@ -165,7 +165,7 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     LinkError
         If the link is damaged, or its drive is impossible.
     TypeError
-        For neither a drive nor a link.
+        If the argument is neither a drive nor a link.
     """
     from lag_envs.envs.unfused import Unfused
     from lag_envs.mechanics.algebra import FormulaError
@@ -187,14 +187,14 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     if env.program.digest != drive.step:
         raise LinkError(
             f"the drive was made with another step ({drive.step}, here {env.program.digest}), by another "
-            "version of lag_envs or of the environment; its bits can only be recomputed with that"
+            "version of lag_envs or of the environment; only that version can recompute its bits"
         )
     keys = drive_keys(drive, task)
     env.reset(drive.seed)
     total, terminated, over = 0.0, False, False
     for i, key in enumerate(keys):
         if over:
-            raise LinkError(f"the episode ends after {i} steps, the link has {len(keys)}: it is forged")
+            raise LinkError(f"the episode ends after {i} steps, but the link has {len(keys)}: it is forged")
         try:
             _, reward, terminated, truncated = env.step(action_from_numbers(key, task))
         except StepRefused as error:
@@ -287,8 +287,8 @@ def _short(text: str) -> str:
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``replay``."""
-    parser.add_argument("link", metavar="LINK", help="the link, or its part after #; quote it")
-    parser.add_argument("--file", metavar="FILE", help="the Python file of your own that has the environment")
+    parser.add_argument("link", metavar="LINK", help="the link, or its part after #, in quotes")
+    parser.add_argument("--file", metavar="FILE", help="your own Python file that defines the environment")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -300,7 +300,7 @@ def run(args: argparse.Namespace) -> int:
 
         task = own_files.made_with_defaults(own_files.one(args.file), args.file)
         if drive.id != task.id:
-            raise LinkError(f"the link is for {_short(drive.id)}, and {args.file} has {task.id!r}")
+            raise LinkError(f"the link is for {_short(drive.id)}, but {args.file} has {task.id!r}")
     found = replay(drive, task)
     steps = len(drive_keys(drive, task or _task(drive.id)))
     ending = (

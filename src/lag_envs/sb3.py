@@ -159,7 +159,7 @@ class VecEnv(vec_env.VecEnv):
         return self._share(name, getattr(self._owner(name), name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of all environments: a batch has only one of each."""
+        """Set an attribute of all environments: they share one value in a batch."""
         self._all(indices, "set")
         setattr(self._owner(attr_name), attr_name, value)
 
@@ -185,11 +185,11 @@ class VecEnv(vec_env.VecEnv):
         return [_row(reported, i, self.num_envs) for i in range(self.num_envs)]
 
     def _owner(self, name: str) -> VectorEnv:
-        """Return who has an attribute: wrappers of vector environments do not pass on what they lack."""
+        """Return the object that has an attribute: vector wrappers do not pass on attributes they lack."""
         return self.env if hasattr(self.env, name) else self.env.unwrapped
 
     def _share(self, name: str, value: Any, indices: Any) -> list[Any]:
-        """Return the part of each environment in what the batch's attribute or method `name` gave."""
+        """Return each environment's part of a value from the batch's attribute or method `name`."""
         chosen: Iterable[int] = self._get_indices(indices)
         if name not in ("tasks", "render"):
             return [_row(value, i, self.num_envs) for i in chosen]
@@ -228,7 +228,7 @@ def _stack(values: Sequence[Any]) -> Any:
     if not all(isinstance(v, Mapping) for v in values):
         return np.array(values)
     if any(set(v) != set(values[0]) for v in values):
-        raise ValueError("either all environments are given the same reset options, or none")
+        raise ValueError("either all environments must be given the same reset options, or none")
     return {name: _stack([v[name] for v in values]) for name in values[0]}
 
 

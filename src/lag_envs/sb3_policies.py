@@ -24,7 +24,7 @@ class _KeptNoise(BasePolicy):
     Parameters
     ----------
     *args, **kwargs
-        Those of the library's policy.
+        Arguments of the library's policy.
     noise_steps : int, default 8
         Number of steps for which noise is kept.
     first_layer_scale : float, default 3
@@ -96,7 +96,7 @@ class TD3(_KeptNoise, TD3Policy):
     Parameters
     ----------
     *args, **kwargs
-        Those of the library's policy, and of the others here.
+        Arguments of the library's policy, and of the other policies here.
     noise : float, default 0.3
         Standard deviation of the noise, for actions in [-1, 1].
     """

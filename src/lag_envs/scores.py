@@ -46,7 +46,7 @@ class KnownReturns(NamedTuple):
 
     `random` and `best` define the scale. They are set once; later, more precise measurements do not change
     them. In a clone, ``python -m agents.scale`` measures all of them again; ``lag_envs/tasks/measured.json``
-    has both.
+    contains both.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def score(env_id: str, mean_return: float) -> float | None:
     Raises
     ------
     ValueError
-        For an unknown id, and a return that is not a finite number.
+        For an unknown id, or a return that is not a finite number.
 
     Examples
     --------

@@ -19,7 +19,7 @@ def start(path: Path) -> Path:
     Raises
     ------
     UserError
-        If the file already exists or cannot be written, or Python cannot import a module of its name.
+        If the file already exists or cannot be written, or if Python cannot import a module of that name.
     """
     if path.suffix != ".py":
         raise UserError(f"{path}: the file's name must end with .py, as in {path.stem or 'my_scene'}.py")
@@ -28,7 +28,7 @@ def start(path: Path) -> Path:
     if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
         raise UserError(f"{path}: the name must be one that Python can import, such as my_scene.py")
     if find_spec(path.stem) is not None:
-        raise UserError(f"{path}: the file would hide an installed module of this name; choose another")
+        raise UserError(f"{path}: the file would hide an installed module of this name; choose another name")
     if not path.absolute().parent.is_dir():
         raise UserError(f"there is no folder {path.absolute().parent}")
     try:

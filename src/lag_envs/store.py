@@ -15,7 +15,7 @@ from typing import Any
 def write_file(path: Path, data: bytes | str, sync: bool = False) -> None:
     """Write a file whole or not at all; with `sync`, a power cut cannot lose it either.
 
-    Links stay, and what they lead to is written. Devices and pipes are written to, not replaced.
+    Links are kept, and the files they lead to are written. Devices and pipes are written to, not replaced.
     """
     content = data.encode() if isinstance(data, str) else data
     if path.exists() and not path.is_file():
@@ -39,7 +39,7 @@ def write_file(path: Path, data: bytes | str, sync: bool = False) -> None:
 
 @contextmanager
 def named(path: Path, part: Path | None = None) -> Iterator[None]:
-    """Name the file in errors that name none, as on a full disk, or only `part`, its unfinished copy."""
+    """Name the file in errors that name no file, as on a full disk, or only its unfinished copy `part`."""
     try:
         yield
     except OSError as error:
@@ -60,7 +60,7 @@ def to_disk(path: Path) -> None:
 
 
 def readable_json(data: Any) -> str:
-    """Return data as JSON, with lists of numbers on a line."""
+    """Return data as JSON, with each list of numbers on one line."""
     text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 

@@ -67,8 +67,8 @@ def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = No
         Its task.
     name : str, optional
         One of `named_agents`, a verified submission of the board by name or id, or the path of a submission's
-        folder, of a model of Stable-Baselines3 or `agents.ppo`, or of the folder of its training. By default
-        the first of `named_agents`.
+        folder, of a model of Stable-Baselines3 or `agents.ppo`, or of the folder of its training. The
+        default is the first of `named_agents`.
     board : Path, optional
         A board's folder.
 
@@ -150,7 +150,7 @@ def _model(env_id: str, task: Any, path: Path) -> Any:
         raise UserError(f'{path}: stable-baselines3 is missing: pip install "lag-envs[agents]"') from error
     seen, own = model.observation_space.shape, source.frames * len(task.observation)
     if seen != (own,):
-        raise UserError(f"{path} observes {seen} numbers, {env_id} has {own}")
+        raise UserError(f"{path} observes {seen} numbers, but {env_id} has {own}")
     return ModelPolicy(model, task, normalise, source.frames)
 
 
@@ -178,7 +178,7 @@ def watch(
     seed : int
         Seed of the first episode; later episodes use the numbers that follow.
     episodes : int, optional
-        Number of episodes; by default one in a video, and in a window until it is closed.
+        Number of episodes; by default, one in a video, and no limit in a window.
     steps : int, optional
         End after this many steps.
     video : Path, optional

@@ -1,7 +1,7 @@
-"""Functions in other processes, or on the machines of a Ray cluster: a crash or hang costs only that work.
+"""Run functions in other processes or on a Ray cluster, where a crash or hang costs only that work.
 
 The context managers yield a function ``submit(function, *args, timeout=None)``, which returns a
-`concurrent.futures.Future`; `as_they_finish` waits for many.
+`concurrent.futures.Future`; `as_they_finish` waits for several futures.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def as_they_finish(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
 
 
 def died(error: BaseException) -> str:
-    """Describe in one line the end of work that raised nothing itself."""
+    """Describe in one line how work ended that raised no exception itself."""
     if (status := getattr(error, "exitcode", None)) is not None:  # Pebble's ProcessExpired
         return f"the process died, exit status {status}"
     return f"{type(error).__name__}: {error}".splitlines()[0]
@@ -49,15 +49,15 @@ def died(error: BaseException) -> str:
 
 @contextmanager
 def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator[Submit]:
-    """Yield a function that submits work to processes of one thread each, which cannot outlive this one.
+    """Yield a function that submits work to single-threaded processes, which cannot outlive this one.
 
     Parameters
     ----------
     count : int
         Number of processes.
     begin : callable, optional
-        Called with `args` in each process before its first work. Work still running when the block is left
-        is killed.
+        Called with `args` in each process before any work. Work still running when the block is left is
+        killed.
     """
     from lag_envs.host import ONE_THREAD
 
@@ -78,7 +78,7 @@ def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator
 
 
 def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
-    """Return Pebble's pool, made to read a dead process's last message before it looks for its work.
+    """Return a Pebble pool that reads a dead process's last message before it looks for the process's work.
 
     That message may say which work the process had taken. Pebble 5.2 does not wait for it: on a busy machine,
     work that dies at once then never finishes, or all work is given up.
@@ -88,7 +88,7 @@ def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
     class Manager(PoolManager):
         rounds = 0
 
-        def process_next_message(self, timeout: float) -> None:  # in a thread of its own, again and again
+        def process_next_message(self, timeout: float) -> None:  # called repeatedly, in a separate thread
             super().process_next_message(timeout)
             self.rounds += 1
 
@@ -108,12 +108,12 @@ def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
 
 
 class Elsewhere:
-    """A copy of an object in a process of its own, which ends with this one.
+    """A copy of an object in a separate process, which ends with this one.
 
     Parameters
     ----------
     thing : object
-        What is copied, with cloudpickle.
+        The object, which is copied with cloudpickle.
     """
 
     def __init__(self, thing: Any) -> None:
@@ -131,7 +131,7 @@ class Elsewhere:
             ) from error
 
     def call(self, method: str, *args: Any) -> Future:
-        """Call a method of the copy; calls are worked on one after the other."""
+        """Call a method of the copy; calls are handled one after the other."""
         return self._pool.submit(_call, method, args)
 
 
@@ -174,8 +174,8 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
     address : str
         "auto" for a running cluster, "local" for one on this machine.
     modules : sequence of Path
-        Folders of modules that are sent to the machines, besides this package; the packages that these
-        import have to be installed there.
+        Folders of modules that are sent to the machines, besides this package; the packages that those
+        modules import must be installed on the machines.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
             None if address == "local" else address, runtime_env=packages, logging_level=logging.ERROR,
             log_to_driver=False,
         )  # fmt: skip
-    except Exception as error:  # this very class is raised if a busy machine's node does not start in time
+    except Exception as error:  # raised as such if a busy machine's node does not start in time
         raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
 
     def submit(function: Callable, *args: Any) -> Future:
@@ -216,7 +216,7 @@ def check_address(address: str) -> None:
             raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
 
 
-# --- one process that keeps what it has when it is stopped --------------------------------------------------
+# --- one process that keeps its results when it is stopped --------------------------------------------------
 
 #: Signals that follow the first one within this time [s] count as the same: `timeout` sends two.
 AT_ONCE = 0.5
@@ -226,11 +226,11 @@ _asked = threading.Event()
 def run_stoppable(command: Sequence[str], environment: Mapping[str, str]) -> int:
     """Run a command that calls `obey_parent`, and return its exit status.
 
-    At the first Ctrl-C or SIGTERM it is asked to stop. It is killed at the second, unless that comes within
-    `AT_ONCE`. It cannot outlive this process.
+    The first Ctrl-C or SIGTERM asks the command to stop. The second one kills it, unless it comes within
+    `AT_ONCE`. The command cannot outlive this process.
     """
     signals = (signal.SIGINT, signal.SIGTERM)
-    # On POSIX, the command goes on ignoring the terminal's Ctrl-C: only this process tells it.
+    # On POSIX, the command keeps ignoring the terminal's Ctrl-C: only this process passes it on.
     before = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
     asked = killed = 0.0
 
@@ -254,7 +254,7 @@ def run_stoppable(command: Sequence[str], environment: Mapping[str, str]) -> int
                 signal.signal(number, stop)
             while (status := child.poll()) is None:
                 with suppress(subprocess.TimeoutExpired):
-                    # On Windows, a wait without end lets no handler run.
+                    # On Windows, no handler runs during a wait without a time limit.
                     child.wait(0.2 if os.name == "nt" else None)
     finally:
         for number, handler in before.items():
@@ -263,7 +263,7 @@ def run_stoppable(command: Sequence[str], environment: Mapping[str, str]) -> int
 
 
 def obey_parent() -> None:
-    """Let the parent stop this process, which ends with it, see `run_stoppable`."""
+    """Let the parent stop this process, which also ends with the parent; see `run_stoppable`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: _asked.set())
 
@@ -277,7 +277,8 @@ def obey_parent() -> None:
 def stopping_point() -> None:
     """Raise KeyboardInterrupt if the parent asked this process to stop.
 
-    A signal could interrupt any code, and some, such as JAX's, then continues as if nothing had happened.
+    A signal could interrupt any code, and some code, such as JAX's, would continue as if nothing had
+    happened.
     """
     if _asked.is_set():
         raise KeyboardInterrupt

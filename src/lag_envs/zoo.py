@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("script", help="train, enjoy, record_video, record_training, ...")
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="PACKAGE")
     given = sys.argv[1:] if arguments is None else list(arguments)
-    if given[:1] in (["-h"], ["--help"]):  # further on, it is the script's
+    if given[:1] in (["-h"], ["--help"]):  # later, it belongs to the script
         parser.print_help()
         return
     args, others = parser.parse_known_args(given)

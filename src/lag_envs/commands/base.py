@@ -19,7 +19,7 @@ from lag_envs.errors import UserError, hint
 from lag_envs.own_files import imported
 
 #: Alternative to ids in `report`.
-OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
+OWN = "a Python file of your own (FILE or FILE:Class), whose code is run"
 #: Alternatives to ids in `info`, `bench`, `order`, `play` and `watch`.
 OWN_OR_MODULE = f"module:ID, which imports the module, or {OWN}"
 
@@ -42,12 +42,12 @@ def known_id(id: str) -> str:
         found = imported(id)
         if "task" not in gym.spec(found).kwargs:
             raise UserError(
-                f"{id} is no task of lag_envs; lag_envs.register(Task) makes an environment of one"
+                f"{id} is not a task of lag_envs; lag_envs.register(Task) makes an environment of a task"
             )
         return found
     raise UserError(
         f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')} "
-        "(a file of your own ends with .py)"
+        "(the name of your own file must end with .py)"
     )
 
 

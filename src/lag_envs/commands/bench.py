@@ -41,13 +41,13 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--output",
         type=new_file,
         metavar="FILE",
-        help="write everything, raw samples included, to this JSON file; with --device the medians",
+        help="write everything, raw samples included, to this JSON file; with --device, only the medians",
     )
     parser.add_argument(
         "--checkout",
         metavar="FOLDER",
         help="write everything into docs/speed.json, docs/speed.md and README.md of this checkout; with "
-        "--device into docs/gpu.json and docs/speed.md",
+        "--device, into docs/gpu.json and docs/speed.md",
     )
     parser.add_argument(
         "--with",
@@ -110,9 +110,9 @@ def run_bench(args: argparse.Namespace) -> int:
             )
         check_checkout("--checkout", args.checkout)
     if args.threads > (cores := usable_cores()):
-        raise UserError(f"--threads {args.threads} needs as many cores; this process may use {cores}")
+        raise UserError(f"--threads {args.threads} needs {args.threads} cores; this process may use {cores}")
     if args.threads > 1 and args.clock == "cpu":
-        raise UserError("--threads needs --clock wall: cpu adds up the time of all threads")
+        raise UserError("--threads needs --clock wall, because cpu adds up the time of all threads")
     for text in args.keywords or ():
         _check_keywords(text, ids)
     quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
@@ -141,7 +141,7 @@ def run_bench(args: argparse.Namespace) -> int:
 def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     """Measure on a GPU."""
     if args.threads > 1 or args.clock == "cpu" or args.cold or args.keywords:
-        raise UserError("--device does not go with --cold, --with, --threads, --clock cpu: leave them out")
+        raise UserError("--device cannot be combined with --cold, --with, --threads or --clock cpu; leave them out")
     if args.checkout is not None:
         if args.ids or args.quick or args.sizes:
             raise UserError(
@@ -164,8 +164,8 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
     if args.ids and (others := [env_id for env_id in ids if env_id not in perfect]):
         raise UserError(
-            f"--device: {', '.join(others)} cannot be on a GPU: imperfect sensors or actuators, or hidden "
-            "parameters"
+            f"--device: {', '.join(others)} cannot run on a GPU, because of imperfect sensors or "
+            "actuators, or hidden parameters"
         )
     about = {
         "date": args.date,
@@ -231,8 +231,8 @@ BENCH = Command(
     "compare the speed with other libraries",
     """Compare steps per second with Gymnasium and, if installed, EnvPool, gymnax and TorchRL, in one
 run on one core: each round takes a sample of every row, and ratios are taken within a round. Then time
-the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so far; a second one
-ends it at once, without them.
+the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so far; a second
+Ctrl-C ends it at once, without results.
 
 examples:
   lag-envs bench --quick                             one environment, under a minute

@@ -26,15 +26,15 @@ def run_cache(args: argparse.Namespace) -> int:
         found = cache.cache_files(place)
         print(f"{place}: {cache.clear(place)} files removed", flush=True)
         if left := [entry.path for entry in found if entry.path.exists()]:
-            print(f"lag-envs: error: cannot be removed: {len(left)}, such as {left[0]}", file=sys.stderr)
+            print(f"lag-envs: error: {len(left)} could not be removed, such as {left[0]}", file=sys.stderr)
         return 1 if left else 0
     kept = cache.cache_files(place)
     size = sum(entry.size for entry in kept)
     rows = [
         ("folder", str(place)),
         ("functions", str(len(kept))),
-        ("size", f"{size / 2**20:.1f} MiB of {cache.LIMIT / 2**20:.0f} at most"),
-        ("writable", "yes" if cache.writable(place) else "no: each process compiles what is not here"),
+        ("size", f"{size / 2**20:.1f} MiB of at most {cache.LIMIT / 2**20:.0f}"),
+        ("writable", "yes" if cache.writable(place) else "no: each process compiles what is missing here"),
     ]
     damaged = [(str(entry.path), why) for entry in kept if (why := cache.damage(entry.path))]
     rows += [("damaged", str(len(damaged)) + (", compiled again when used next:" if damaged else ""))]

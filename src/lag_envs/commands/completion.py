@@ -9,7 +9,7 @@ from lag_envs import TASKS
 from lag_envs.commands.base import Command, needs
 
 SHELLS = ("bash", "zsh", "tcsh")
-#: Completion of environments and users' own files, for shells that complete by functions.
+#: Completion of environments and users' own files, for shells that complete by calling functions.
 COMPLETE_ID = {"bash": "_lag_envs_ids", "zsh": "_lag_envs_ids", "tcsh": "f:*.py"}
 
 
@@ -19,7 +19,7 @@ def declare_completion(parser: argparse.ArgumentParser) -> None:
 
 
 def run_completion(args: argparse.Namespace) -> int:
-    """Print the script with which a shell completes the command."""
+    """Print the script that lets a shell complete the command."""
     needs("completion", "shtab")
     import shtab
 
@@ -57,7 +57,7 @@ def _parsers(whole: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 COMPLETION = Command(
     "completion",
     "print a script that completes this command in a shell",
-    """Print a script with which a shell completes commands, options, environments and files (extra
+    """Print a script that lets a shell complete commands, options, environments and files (extra
 `completion`).
 
 examples:

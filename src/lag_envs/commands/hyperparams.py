@@ -30,8 +30,8 @@ HYPERPARAMS = Command(
     "hyperparams",
     "print hyperparameters for the RL Zoo",
     """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the format of
-the RL Zoo (extra `zoo`). The agents of docs/agents.md were trained with them. Those of
-fast_ppo, shac and cloning are for `python -m agents.train`, in a clone.
+the RL Zoo (extra `zoo`). The agents of docs/agents.md were trained with them. The
+hyperparameters of fast_ppo, shac and cloning are for `python -m agents.train`, in a clone.
 
 examples:
   lag-envs hyperparams ppo > ppo.yml

@@ -75,7 +75,7 @@ def _agents(task: Task, name: str, given: str) -> list[str]:
     from lag_envs.scores import known_returns
     from lag_envs.watch import named_agents
 
-    lines = ["", "Agents by name, and how to see them", *_rows(named_agents(task, name))]
+    lines = ["", "Agents by name, and how to watch them", *_rows(named_agents(task, name))]
     lines += [f"  lag-envs watch {given} --agent NAME, or drive yourself: lag-envs play {given}"]
     if scale := known_returns(name):
         lines += [

@@ -20,7 +20,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``report``."""
     parser.add_argument(
         "places", metavar="[FILE] [FOLDER]", nargs="*",
-        help=f"{OWN}, if it is to be measured; and where to write (default: report, or report-NAME)",
+        help=f"FILE: {OWN}, to be measured; FOLDER: where to write (default: report, or report-NAME)",
     )  # fmt: skip
     parser.add_argument(
         "--quick", action="store_true", help="fewer cases and methods, the pivoted bar first: under a minute"
@@ -28,14 +28,14 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sections",
         metavar="NAME,...",
-        help="only these: environments, work_precision, general, bound, stability, conservation, leave_out",
+        help="only these sections: environments, work_precision, general, bound, stability, conservation, leave_out",
     )
     parser.add_argument(
         "--processes", metavar="N", type=count, default=os.cpu_count() or 1,
         help="parallel jobs (default: one per core); timings always run alone",
     )  # fmt: skip
     declare_date(parser, "on the page")
-    parser.add_argument("--docs", metavar="PROJECT", help="then write docs/accuracy in this checkout")
+    parser.add_argument("--docs", metavar="PROJECT", help="afterwards, write docs/accuracy in this checkout")
 
 
 def run_report(args: argparse.Namespace) -> int:
@@ -85,8 +85,8 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
     for place in folders:
         if not Path(place).is_dir() and re.search(r":|-v\d+$", place):
             raise UserError(
-                f"{place} is no FILE, and looks like an id: for scenes of your own name their file, as in "
-                "mine.py; a FOLDER of this name must exist already"
+                f"{place} is not a FILE, and looks like an id; for scenes of your own, name their file, "
+                "as in mine.py; a FOLDER of this name must exist already"
             )
     if len(files) > 1 or len(folders) > 1:
         raise UserError(f"at most one FILE and one FOLDER, got {' '.join(places)}")
@@ -102,8 +102,8 @@ REPORT = Command(
     "measure errors, and write a page about them",
     """Measure the error of every environment and scene against high precision, beside common integrators
 and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
-Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
-Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part if they are installed.
+Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept, so
+run it again to resume after Ctrl-C. heyoka, diffrax, torchdiffeq and MuJoCo take part if they are installed.
 
 examples:
   lag-envs report --quick                            a first look, under a minute

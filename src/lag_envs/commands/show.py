@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def declare_play(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``play``."""
-    _declare_shown(parser, "seed of the starts")
+    _declare_shown(parser, "seed of the initial states")
 
 
 def run_play(args: argparse.Namespace) -> int:
@@ -39,19 +39,19 @@ def run_play(args: argparse.Namespace) -> int:
 
 def declare_watch(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``watch``."""
-    _declare_shown(parser, "seed of the first episode; the next episodes count on from it")
+    _declare_shown(parser, "seed of the first episode; later episodes use the numbers that follow")
     parser.add_argument(
         "--agent",
         metavar="NAME|FILE",
-        help="its name, as listed by `lag-envs info ID` or on the board; a submission's folder; or a model"
-        " of Stable-Baselines3 (a zip, or the folder of its training), whose code is run (default: the policy"
-        " that comes with the package, or zero)",
+        help="the agent's name, as listed by `lag-envs info ID` or on the board; a submission's folder; or a"
+        " model of Stable-Baselines3 (a zip, or the folder of its training), whose code is run (default: the"
+        " policy that comes with the package, or zero)",
     )
     parser.add_argument(
         "--episodes",
         metavar="N",
         type=count,
-        help="number of episodes (default: 1 with --video, otherwise no end)",
+        help="number of episodes (default: 1 with --video, otherwise no limit)",
     )
     parser.add_argument(
         "--video", metavar="FILE", type=Path, help="write an .mp4 or .gif instead of opening a window"
@@ -99,8 +99,8 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     parser.add_argument(
         "id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN_OR_MODULE}"
     )
-    parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
-    parser.add_argument("--steps", metavar="N", type=count, help="end after N steps (default: no end)")
+    parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: a different one each time)")
+    parser.add_argument("--steps", metavar="N", type=count, help="end after N steps (default: no limit)")
     parser.add_argument("--arrows", action="store_true", help="show arrows for controls and forces")
     parser.add_argument(
         "--trail", metavar="S", type=seconds, default=0.0,
@@ -108,7 +108,7 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--readout", action="store_true",
-        help="show time, return, controls and state below, and the score once an episode is over",
+        help="show time, return, controls and state below the picture, and the score once an episode is over",
     )  # fmt: skip
 
 
@@ -137,9 +137,9 @@ def _shown(args: argparse.Namespace) -> tuple[str, Task]:
 PLAY = Command(
     "play",
     "drive an environment by keys or gamepad",
-    """Drive an environment in a window, in real time: the arrow keys are for the first two controls,
-a, d, s and w for two more; the sticks of a gamepad do the same, in proportion. r starts over, q ends.
-At an episode's end it shows the return, and the score on the leaderboard's scale.
+    """Drive an environment in a window, in real time. The arrow keys drive the first two controls, and
+a, d, s and w two more; the sticks of a gamepad do the same, in proportion. r starts over, q ends.
+The end of an episode shows its return, and its score on the leaderboard's scale.
 
 examples:
   lag-envs play PivotedBar-v0
@@ -152,9 +152,9 @@ examples:
 WATCH = Command(
     "watch",
     "watch an agent, in a window or as a video",
-    """Watch an agent drive an environment, in a window, or write a video. By default it is the policy
-that comes with the package, the best network or table of the leaderboard; controllers are chosen by
-name. It needs the extras render and leaderboard; models of your own need agents too.
+    """Watch an agent drive an environment, in a window, or write a video. By default, the agent is the
+policy that comes with the package, the best network or table of the leaderboard; controllers are chosen
+by name. This needs the extras render and leaderboard; models of your own also need agents.
 
 examples:
   lag-envs watch PivotedBar-v0

@@ -17,7 +17,7 @@ from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import MOST_DRAWN
 
-#: Names of the unchanged environment, and of acting ten times as often.
+#: Names of two conditions: the unchanged environment, and acting ten times as often.
 NOMINAL, OFTEN = "nominal", "ten times as often"
 
 
@@ -47,15 +47,15 @@ class Condition:
         return int(TASKS[env_id](**self.options).limit)
 
     def suits(self, agent: Any, plans: bool) -> bool:
-        """Return whether an agent can act under it; planning and some memories need one control interval.
+        """Return whether an agent can act under the condition; plans and some memories need one interval.
 
         Parameters
         ----------
         agent : object
-            The agent. If it has a `pace`, it counts steps and can be told their length; `of_one_interval`
-            says that its memory is of steps of one length.
+            The agent. An agent with a `pace` counts steps and can be given their length; `of_one_interval`
+            says that its memory expects steps of one length.
         plans : bool
-            Whether it plans.
+            Whether the agent plans.
         """
         of_one = plans or getattr(agent, "of_one_interval", False)
         return "dt" not in self.options or hasattr(agent, "pace") or not of_one
@@ -67,7 +67,7 @@ def often(env_id: str) -> Condition:
 
 
 def disturbances(env_id: str) -> list[Condition]:
-    """Return a condition for each of the environment's numbers off by 20 %, unknown to policies.
+    """Return conditions in which one of the environment's numbers is off by 20 %, unknown to policies.
 
     Values that the environment refuses, such as a friction beyond its range, are left out.
     """
@@ -99,10 +99,10 @@ def _positive(env_id: str) -> dict[str, float]:
 def imperfections(env_id: str) -> list[Condition]:
     """Return conditions of imperfect sensors and actuators, and of hidden parameters.
 
-    Observation noise of 0.01, where tasks scale entries to about 1; actions that are one control interval
-    late; actuators with a lag of two intervals; occasional pushes of 2 % of the largest rate; the
-    environment's numbers, the first `MOST_DRAWN` of them, drawn within 20 % in each episode. Imperfections
-    that the environment already has stay as they are.
+    They are observation noise of 0.01 (tasks scale entries to about 1); actions that are one control interval
+    late; actuators with a lag of two intervals; occasional pushes of 2 % of the largest rate; and the first
+    `MOST_DRAWN` of the environment's numbers, drawn within 20 % in each episode. Imperfections that the
+    environment already has stay as they are.
     """
     kind: Any = TASKS[env_id]
     task = kind()
@@ -138,7 +138,7 @@ def on_board(env_id: str) -> list[Condition]:
 
 
 def conditions(env_id: str) -> list[Condition]:
-    """Return all conditions: the board uses the first few kinds, the agents' results noise and delay too."""
+    """Return all conditions: boards use the first few kinds; the agents' results use noise and delay too."""
     noise = [Condition(f"noise {level} %", noise=0.01 * level) for level in (1, 5)]
     return [Condition(), often(env_id), *disturbances(env_id), *noise, Condition("late", late=True)]
 

@@ -37,7 +37,7 @@ class RolloutStep(NamedTuple):
     terminated, truncated : ndarray of bool, shape (episodes,)
         Which episodes ended.
     running : ndarray of bool, shape (episodes,)
-        Which had not ended before; the others do not count.
+        Which episodes had not ended before; the others do not count.
     """
 
     observation: NDArray
@@ -130,7 +130,7 @@ class Meter:
     Parameters
     ----------
     total : int
-        Upper limit of the steps of all of them.
+        Upper limit of the steps of all roll-outs together.
     show : callable
         Called now and then with the steps taken so far, and the total.
     """
@@ -172,11 +172,11 @@ def observation_std(env_id: str, seeds: Sequence[int]) -> Array:
     return np.concatenate(seen).std(axis=0, dtype=np.float64)
 
 
-# --- what is noted ------------------------------------------------------------------------------------------
+# --- what is recorded ---------------------------------------------------------------------------------------
 
 
 def arrivals(inside: Mask, steps: NDArray) -> tuple[Array, NDArray[np.int64]]:
-    """Return the step after which something first holds, and the one from which on it holds for good.
+    """Return the step after which something first holds, and the step from which it holds for good.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def arrivals(inside: Mask, steps: NDArray) -> tuple[Array, NDArray[np.int64]]:
 
 
 class Outcome:
-    """Watches episodes: when the task's goal is reached, the effort, and a hash of everything that happens.
+    """Records when a task's goal is reached, the effort, and a hash of everything that happens in episodes.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ class Luck(NamedTuple):
     slope : float
         Slope of the returns over the other agent's; 0 if the returns are better left as they are.
     error : float
-        What the slope's own standard error adds to that of the corrected mean.
+        What the slope's own standard error adds to the standard error of the corrected mean.
     """
 
     slope: float = 0.0
@@ -118,11 +118,11 @@ class Luck(NamedTuple):
 
 
 def luck_of(returns: ArrayLike, luck: ArrayLike, mean: float) -> Luck:
-    """Return how far luck accounts for returns, by linear regression over another agent's.
+    """Return how far luck accounts for returns, by linear regression on another agent's returns.
 
     The returns' mean can be corrected to what it would be if the other agent had had its true mean in these
     episodes. The slope is 0 where that would not make the mean more certain: the slope of a few episodes, in
-    which the other agent always does nearly the same, says nothing about those in which it does not.
+    which the other agent always does nearly the same, says nothing about episodes in which it does not.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def without_luck(returns: ArrayLike, reference: ArrayLike | None) -> tuple[float
     returns : array_like, shape (n,)
         An agent's returns.
     reference : array_like, shape (m,), optional
-        The reference's in the same and more episodes.
+        The reference's returns in the same episodes, followed by more.
 
     Examples
     --------
@@ -211,7 +211,7 @@ def interval(statistic: Callable[..., Any], *strata: ArrayLike) -> list[float] |
     Returns
     -------
     list of float, or None
-        Lower and upper end; None if a stratum has a single element, which shows nothing of the spread.
+        Lower and upper end; None if a stratum has a single element, which says nothing about the spread.
     """
     if any(np.size(s) < 2 for s in strata):
         return None
@@ -237,7 +237,7 @@ def estimate(groups: Sequence[ArrayLike]) -> dict[str, Any]:
     Parameters
     ----------
     groups : sequence of array_like, shape (episodes,)
-        One for each training seed; a single one for an agent that was not trained.
+        One array for each training seed; a single one for an agent that was not trained.
 
     Returns
     -------
