@@ -180,7 +180,7 @@ def test_a_result_is_edited(board):
 def test_a_result_and_its_hash_are_edited(board):
     relog(board, edit(board, better), chain=False)
     assert re.search(r"line \d+ is not what it was in commit \w+", refused(board))
-    assert "line 11 is not what followed" in wrong(board)["log"][0]
+    assert "line 11 does not follow" in wrong(board)["log"][0]
     told = lines(board)
     relog(board, told)  # and the chain is made again
     assert "line 10 is not what it was in commit" in refused(board)
@@ -440,9 +440,12 @@ def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
     assert refused(board) == "" and wrong(board) == {}
     whole = lines(board)
     for change, reason in (
-        (lambda told: told[-2].update(reason="other"), "a line up to 13 was changed"),
+        (lambda told: told[-2].update(reason="other"), "one of the first 13 lines was changed"),
         (lambda told: told.__delitem__(slice(-2, None)), "some were removed"),
-        (lambda told: at(told, "protocol")["scales"][ENV].update(best=100.0), "a line up to 13 was changed"),
+        (
+            lambda told: at(told, "protocol")["scales"][ENV].update(best=100.0),
+            "one of the first 13 lines was changed",
+        ),
     ):
         told = json.loads(json.dumps(whole))
         change(told)
@@ -493,7 +496,7 @@ def test_commands(board, tmp_path, capsys):
     assert status == 0 and out.startswith(f"nonce: {head}\n")
     assert lines(board)[-2]["source"] == "commit"
     assert run(capsys, "open", "--board", board.folder)[1].startswith(
-        "protocol 3; to be verified under it: 3"
+        "protocol 3; submissions to verify under it: 3"
     )
     commit(board)
     id, told = entry_of(board).id, lines(board)

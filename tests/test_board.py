@@ -157,7 +157,7 @@ def test_files_that_change_while_they_are_copied(board):
     folder = write(board.folder.parent / "changing")
     submission = fake_submissions.load(folder)
     (folder / "policy_0.safetensors").write_bytes(b"others")
-    with pytest.raises(BoardError, match="changes while it is read"):
+    with pytest.raises(BoardError, match="changed while it was read"):
         board.add(submission)
     assert states(board) == {}
     board.add(fake_submissions.load(folder))

@@ -119,18 +119,18 @@ def rewritten(board, change):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda told: told.pop(1), "line 3: .* is verified, and was never added"),
+        (lambda told: told.pop(1), "line 3: .* is verified, but was never added"),
         (lambda told: told.pop(0), "line 4: .*|does not state the scale"),
         (lambda told: told.pop(2), "line 3: .* nonce 'n', which is not its own"),
         (lambda told: told.insert(1, told.pop(2)), "line 3: .* is earlier than the line before it"),
         (lambda told: told.append(told[3]), "line 5: .* is verified, but was verified already"),
-        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* is already there, verified"),
+        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* already on the board, verified"),
         (lambda told: told.append(told[2] | {"at": told[3]["at"]}), "line 5: the nonce 'n' was published"),
         (lambda told: told[3].update(nonce="other"), "line 4: .* which is not its own"),
         (lambda told: told[3].update(supersedes=[told[1]["id"]]), "line 4: .* not another result"),
         (lambda told: told[3].update(supersedes=["Gone"]), "line 4: .* not another result"),
-        (lambda told: told[0].update(number=2), "line 1: protocol 2 begins where 1 would be the next"),
-        (lambda told: told[1].update(protocol=2), "line 2: .* added under protocol 2, the current is 1"),
+        (lambda told: told[0].update(number=2), "line 1: protocol 2 begins, but the next would be 1"),
+        (lambda told: told[1].update(protocol=2), "line 2: .* protocol 2, but the current one is 1"),
         (lambda told: told[3].update(event="rejected"), "line 4 is not an event"),
     ],
 )  # fmt: skip

@@ -142,7 +142,9 @@ def test_a_link_with_a_key_after_the_end_is_forged_for_page_and_command(drive, l
         f"The link is forged: its episode ends after {n} steps, but it has keys for {n + 1}."
     )
     assert cli.main(["replay", longer]) == 2
-    assert f"the episode ends after {n} steps, but the link has {n + 1}: it is forged" in capsys.readouterr().err
+    assert (
+        f"the episode ends after {n} steps, but the link has {n + 1}: it is forged" in capsys.readouterr().err
+    )
 
 
 def test_part_of_an_episode_has_no_score(drive):

@@ -128,7 +128,7 @@ def test_file_too_large(folder, name, most):
     os.truncate(folder / name, most + 1)
     refused(folder, f"{name} has {most + 1} bytes")
     os.truncate(folder / name, 2**40)  # sparse: to read it would take for ever
-    refused(folder, "bytes, at most")
+    refused(folder, "bytes; at most")
 
 
 def test_files_too_large_together(folder):
@@ -420,13 +420,13 @@ FEEDBACKS = {s: LINEAR | {"offset": np.full(1, 0.1 * s)} for s in range(5)}
         ({"axes": []}, {}, "axes: List should have at least 1 item"),
         ({"axes": ["x"] * 6}, {}, "axes: List should have at most 5 items"),
         ({"axes": ["x", "x"]}, {}, "axes must differ"),
-        ({"axes": ["x", "theta"]}, {}, "axes must be of x, w, phi"),
-        ({"axes": ["x", "x - w"]}, {}, "axes must be of x, w, phi"),
+        ({"axes": ["x", "theta"]}, {}, "axes must be among x, w, phi"),
+        ({"axes": ["x", "x - w"]}, {}, "axes must be among x, w, phi"),
         ({"axes": ["x", 1]}, {}, "axes.1: Input should be a valid string"),
         ({"axes": ["x", "w", "phi"]}, {}, "'axis_2' is missing"),
         ({"kind": "code"}, {}, "kind: Input should be '"),
         ({"kind": "value", "actions": 1000}, {}, "actions: Input should be "),
-        ({"actions": 5}, {}, "actions means nothing in a table of actions; leave it out"),
+        ({"actions": 5}, {}, "actions has no meaning in a table of actions; leave it out"),
         ({"mirror": "time"}, {}, "mirror must be one of the axes"),
         ({"mirror": "phi"}, {}, "mirror must be one of the axes"),
         ({"mirror": [1]}, {}, "mirror: Input should be a valid string"),
@@ -593,7 +593,7 @@ def test_copies_of_one_policy_are_refused(nets):
 
 def test_networks_have_a_limit_together(tmp_path, monkeypatch):
     monkeypatch.setattr(protocol, "ALL_NUMBERS", 90)
-    with pytest.raises(Refused, match="have 95 numbers together, at most 90 are accepted"):
+    with pytest.raises(Refused, match="have 95 numbers together; at most 90 are accepted"):
         learned(tmp_path / "it")
 
 

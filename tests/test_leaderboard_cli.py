@@ -61,7 +61,7 @@ def test_from_adding_to_the_ranking(run):
     assert out == "leaderboard is a new board\n" + waits
     beacon = "https://api.drand.sh/public/1234"
     assert run("nonce", "drand-1234", "--source", beacon) == (0, f"nonce: drand-1234\n{id}: verified\n", "")
-    assert run("add", "a")[1] == f"{id}: is there already, verified\n"
+    assert run("add", "a")[1] == f"{id}: is already on the board, verified\n"
     status, out, _ = run("list")
     assert status == 0 and re.search(rf"1 +0\.\d{{4}} +0\.\d+ to 0\.\d+ +100\.0 % +learned +PPO +{id}", out)
     assert run("list", ENV)[1] == out
@@ -105,7 +105,7 @@ def test_the_same_command_goes_on_after_a_kill(run):
     run("add", "a")
     Board("leaderboard").publish("n")  # and killed here
     assert run("add", "a", "--nonce", "n") == (0, f"{ids()[0]}: verified\n", "")
-    assert run("add", "a", "--nonce", "n")[:2] == (0, f"{ids()[0]}: is there already, verified\n")
+    assert run("add", "a", "--nonce", "n")[:2] == (0, f"{ids()[0]}: is already on the board, verified\n")
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_ctrl_c_tells_how_to_go_on(run, monkeypatch, action, again):
     with monkeypatch.context() as patched:
         patched.setattr("lag_envs.leaderboard.cli.finish", interrupted)
         status, _, err = run(*action, "--board", "my board")
-    assert status == 130 and err.endswith(f"interrupted; what is done is kept, {again} resumes\n")
+    assert status == 130 and err.endswith(f"interrupted; finished work is kept, and {again} resumes\n")
     assert run("add", "--board", "my board")[1].endswith(": verified\n")
 
 
@@ -143,7 +143,7 @@ def test_withdraw(run):
     status, _, err = run("withdraw", id, "--reason", "wrong\x1b[2J numbers")
     assert status == 2 and "this cannot be logged: withdrawn.reason: it holds the invisible U+001B" in err
     status, _, err = run("withdraw", id, "--reason", " ")
-    assert status == 2 and "a reason is needed" in err
+    assert status == 2 and "give a reason" in err
     assert run("withdraw", id, "--reason", "wrong numbers")[0] == 0
     assert f"{id} withdrawn: wrong numbers" in run("list")[1]
     assert run("withdraw", id, "--reason", "x") == (2, "", f"lag-envs: error: {id} was withdrawn before\n")

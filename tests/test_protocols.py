@@ -81,7 +81,7 @@ def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
         *parse(board.log.read_bytes())[0],
         LogLine(99, told.event.model_copy(update={"at": board.read().last})),
     ]
-    with pytest.raises(BoardError, match=f"{new} joins protocol 1, and has a board there already"):
+    with pytest.raises(BoardError, match=f"{new} joins protocol 1, but already has a board there"):
         fold(again)
     assert board.open() == 2  # now that all are there
 

@@ -343,7 +343,7 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     good["policies"][0]["returns"] = [r + 0.1 for r in good["policies"][0]["returns"]]
     out.write_text(json.dumps([good]))
     assert command(*again) == 1
-    assert "too far from it: the bits, though both are of the same build" in capsys.readouterr().out
+    assert "differs too much in the bits, though both are of the same build" in capsys.readouterr().out
     good["build"] = None
     out.write_text(json.dumps([good]))
     assert command(*again) == 0
@@ -351,7 +351,7 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     good["policies"][0]["returns"][0] += 100.0
     out.write_text(json.dumps([good]))
     assert command(*again) == 1
-    assert "too far from it: mean returns by" in capsys.readouterr().out
+    assert "differs too much in mean returns by" in capsys.readouterr().out
 
 
 def test_command_compares_only_what_can_be_compared(tmp_path, capsys, monkeypatch, submission, result):
@@ -365,7 +365,7 @@ def test_command_compares_only_what_can_be_compared(tmp_path, capsys, monkeypatc
 
     known(digest="0" * 64)
     assert command(*given) == 1
-    assert f"{before} has nothing about it (digest {submission.digest})" in capsys.readouterr().err
+    assert f"{before} has no result of it (digest {submission.digest})" in capsys.readouterr().err
     known()
     with pytest.raises(UserError, match="with --episodes 6, not 7; only the same episodes"):
         command(*given, "--episodes", 7)

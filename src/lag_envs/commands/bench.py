@@ -141,7 +141,9 @@ def run_bench(args: argparse.Namespace) -> int:
 def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     """Measure on a GPU."""
     if args.threads > 1 or args.clock == "cpu" or args.cold or args.keywords:
-        raise UserError("--device cannot be combined with --cold, --with, --threads or --clock cpu; leave them out")
+        raise UserError(
+            "--device cannot be combined with --cold, --with, --threads or --clock cpu; leave them out"
+        )
     if args.checkout is not None:
         if args.ids or args.quick or args.sizes:
             raise UserError(

@@ -32,7 +32,7 @@ EXPORT = Command(
     "turn a trained model into a submission",
     """Turn models of Stable-Baselines3 into a submission to the leaderboard, which contains only data, and
 check that both act alike. Loading a model runs code, so export only your own. Networks from
-`python -m agents.ppo` are data already, and are taken as they are.
+`python -m agents.ppo` are data already, and are used as they are.
 
 examples:
   lag-envs export runs/PivotedBar-v0/ppo --author "A. Author" --license MIT    all seeds of a local training
@@ -59,7 +59,7 @@ REPLAY = Command(
     "replay",
     "recompute a drive from its link",
     """Recompute a drive, given as a link from the leaderboard's page, from its seed and keys, with
-arithmetic that has the same bits on every machine, and tell whether the link claims the right return.
+arithmetic that has the same bits on every machine, and check whether the link claims the right return.
 The exit status is 0 if it does, 1 if it does not, 2 for a damaged link.
 
 examples:
@@ -72,12 +72,12 @@ LEADERBOARD = Command(
     "leaderboard",
     "keep the leaderboard",
     """Keep a leaderboard: add submissions, recompute their scores, show and publish the ranking. A
-submission is verified with a nonce that was published after it was added: `add` adds it, `nonce`
-publishes one and verifies all that are waiting. After Ctrl-C, or a kill, `add` without a folder resumes.
+submission is verified with a nonce that is published after the submission was added: `add` adds it, `nonce`
+publishes a nonce and verifies all that wait for one. After Ctrl-C or a kill, `add` without a folder resumes.
 
 examples:
   lag-envs leaderboard add my-submission             add it; it waits for the next nonce
-  lag-envs leaderboard nonce 5f3c...                 publish a nonce, verify all that waits for it
+  lag-envs leaderboard nonce 5f3c...                 publish a nonce, and verify what waits for it
   lag-envs leaderboard add mine/* --nonce test-1     both at once, for a board of your own
   lag-envs leaderboard list PivotedBar-v0            the ranking, and the state of all other submissions
   lag-envs leaderboard serve                         the page, at http://127.0.0.1:8000

@@ -20,7 +20,8 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``report``."""
     parser.add_argument(
         "places", metavar="[FILE] [FOLDER]", nargs="*",
-        help=f"FILE: {OWN}, to be measured; FOLDER: where to write (default: report, or report-NAME)",
+        help=f"FILE: {OWN}, to be measured; FOLDER: where to write "
+        "(default: report, or report-NAME)",
     )  # fmt: skip
     parser.add_argument(
         "--quick", action="store_true", help="fewer cases and methods, the pivoted bar first: under a minute"
@@ -28,7 +29,8 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sections",
         metavar="NAME,...",
-        help="only these sections: environments, work_precision, general, bound, stability, conservation, leave_out",
+        help="only these sections: environments, work_precision, general, bound, stability, conservation, "
+        "leave_out",
     )
     parser.add_argument(
         "--processes", metavar="N", type=count, default=os.cpu_count() or 1,

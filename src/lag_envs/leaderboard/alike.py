@@ -1,10 +1,10 @@
 """Find policies that act alike, however different their numbers are.
 
-Both play the same episodes, which follow from the nonce. Each is also asked what it would do at the states on
-the other's path. Two policies are alike if their clipped actions at the states on both paths differ by less
-than `ACTIONS` (root mean square), or if their episodes' returns differ by less than `RETURNS` standard errors
-of a mean return (root mean square). Where all episodes of both pay the same, as with two perfect policies,
-returns tell nothing, and only actions count.
+Two policies play the same episodes, which follow from the nonce. Each is also asked what it would do in the
+states on the other's path. The two are alike if their clipped actions at the states on both paths differ by
+less than `ACTIONS` (root mean square), or if their episodes' returns differ by less than `RETURNS` standard
+errors of a mean return (root mean square). Where all episodes of both pay the same, as with two perfect
+policies, returns tell nothing, and only actions count.
 
 Noise of 1e-4 on all numbers of our networks moves their actions by up to 4e-3; the closest two of our
 separately trained policies are 1.4e-2 apart.
@@ -35,7 +35,7 @@ TWINS = 1e-3
 
 
 class Distance(NamedTuple):
-    """How far apart two policies are: of actions (rms), and of returns (rms, in standard errors)."""
+    """How far apart two policies are: in actions (rms), and in returns (rms, in standard errors)."""
 
     actions: float
     returns: float
@@ -61,7 +61,7 @@ class PlayedPolicy:
     played : Episodes
         The episodes.
     returns : ndarray, shape (episodes,)
-        What it got in each.
+        Its return in each episode.
     quick : bool
         Whether it has no memory, so that it can be asked at many states at once.
     """
@@ -89,7 +89,7 @@ class PlayedPolicy:
         return total / float(self.played.steps.sum()) / off.shape[-1]
 
     def _off(self, action: Array, own: Array) -> Array:
-        """Return how far actions are from its own, shape (n, numbers): 1 for another choice from a list."""
+        """Return how far actions are from `own`, shape (n, numbers): 1 for another choice from a list."""
         off = np.asarray(action, np.float64) - own
         if self.played.task.formulas.choices:
             off = np.sign(np.abs(off))
@@ -97,7 +97,7 @@ class PlayedPolicy:
 
     def _asked_at_once(self, agent: Any) -> float:
         where = np.flatnonzero(self.played.running.ravel())
-        # Evenly over all times and episodes. The nonce decides which episodes these are.
+        # Spread evenly over all times and episodes. The nonce decides which episodes these are.
         where = where[np.linspace(0, len(where) - 1, min(STATES, len(where))).astype(np.int64)]
         arrays = self.played.observations, self.played.actions
         seen, did = (array.reshape(-1, *array.shape[2:])[where] for array in arrays)
@@ -131,7 +131,7 @@ def distance(a: PlayedPolicy, b: PlayedPolicy, error: float) -> Distance:
     returns = min(off / error, FAR.returns) if error > 0.0 else FAR.returns * (off > 0.0)
     if np.ptp([a.returns, b.returns]) == 0.0:
         returns = FAR.returns
-    # First the one that can be asked at all states at once: the other may be slow.
+    # First ask the policy that can be asked at all states at once: the other may be slow.
     first, second = (a, b) if b.quick else (b, a)
     actions = 0.5 * first.asked(second)
     if actions < ACTIONS**2:
@@ -167,7 +167,7 @@ class Likeness:
         return self._tracks[submission.digest]
 
     def __call__(self, newer: Submission, older: Submission, error: float) -> Distance:
-        """Return the distance of a submission from an older one: half of its policies are no farther away.
+        """Return the distance of a submission from an older one, within which half of its policies lie.
 
         Parameters
         ----------

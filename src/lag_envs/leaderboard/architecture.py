@@ -45,7 +45,7 @@ class Architecture(ABC):
 
     #: What the table ``[policy]`` must be.
     table: type[Strict] = PolicyTable
-    #: First version of ``submission.toml`` that has it.
+    #: First version of ``submission.toml`` that has this architecture.
     schema = 1
     #: The kind of such policies; if empty, they are learned if there is a training, and controllers
     #: otherwise.
@@ -54,7 +54,7 @@ class Architecture(ABC):
     arrays: dict[str, Shape]
     #: Whether it searches for a plan in each episode, see `protocol.PLANNED`.
     plans = False
-    #: The module with the agent's code; empty if its arrays say all.
+    #: The module with the agent's code; empty if its arrays say everything.
     module = ""
 
     @abstractmethod

@@ -5,8 +5,8 @@ earlier commits, each submission against its digest and the log, each result aga
 statements. `audit` adds the slow ones: each nonce against its public source, and results against the
 submissions, by playing episodes again.
 
-One thing cannot be found: a history rewritten as a whole, commits and all, when nobody has an older copy, a
-release or its pin to compare with.
+One thing cannot be detected: a history rewritten as a whole, commits and all, when nobody has an older copy,
+a release or its pin to compare with.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 PIN = Path(__file__).with_name("pin.json")
 #: Episodes of each policy that `audit` plays again.
 SAMPLE = 4
-#: Episodes of each reference that it plays, and by how many standard errors their mean may be off.
+#: Episodes of each reference that `audit` plays, and by how many standard errors their mean may be off.
 REFERENCE_EPISODES, SIGMAS = 8192, 5.0
 
 Results = dict[tuple[int, str], dict[str, Any]]
@@ -81,11 +81,11 @@ class Finding:
     name: str
     told: str = ""
     wrong: list[str] = field(default_factory=list)
-    #: Why it could not be made, and who could make it.
+    #: Why the check could not be made, and who could make it.
     open: str = ""
 
 
-# --- what is cheap ------------------------------------------------------------------------------------------
+# --- the cheap checks ---------------------------------------------------------------------------------------
 
 
 def sound(board: Board) -> tuple[BoardState, Results]:
@@ -124,7 +124,7 @@ class CheapChecks:
 
 
 def cheap(board: Board, pin: Path | None = None) -> CheapChecks:
-    """Make all cheap checks."""
+    """Run all cheap checks."""
     chain = Finding("log")
     found = CheapChecks([chain])
     try:
@@ -141,7 +141,7 @@ def cheap(board: Board, pin: Path | None = None) -> CheapChecks:
     if whole:
         chain.told += f", head {hashlib.sha256(whole).hexdigest()}"
     if torn:
-        chain.told += "; the last line is torn off, the next write removes it"
+        chain.told += "; the last line is torn off and will be removed by the next write"
     found.findings += [
         _pinned(board, whole, pin),
         _history(board, whole),
@@ -198,11 +198,12 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
     begun = b"\n".join(lines[: pin.lines]) + b"\n"
     if len(lines) <= pin.lines:
         found.wrong.append(
-            f"{board.log} has {len(lines) - 1} lines, {path} pins {pin.lines}: some were removed; {REMEDY}"
+            f"{board.log} has {len(lines) - 1} lines, but {path} pins {pin.lines}: some were removed;"
+            f" {REMEDY}"
         )
     elif hashlib.sha256(begun).hexdigest() != pin.head:
         found.wrong.append(
-            f"{board.log} is not what {path} pins: a line up to {pin.lines} was changed; {REMEDY}"
+            f"{board.log} is not what {path} pins: one of the first {pin.lines} lines was changed; {REMEDY}"
         )
     else:
         found.told = f"the first {pin.lines} lines are those that {path.name} pins"
@@ -232,11 +233,11 @@ def _submissions(board: Board, found: CheapChecks) -> Finding:
         try:
             told = found.abouts[entry.id] = about(files)
         except Refused:
-            continue  # it was accepted once; since then its environment, say, has gone
+            continue  # it was accepted once; since then, its environment may have been removed
         for name in ("env", "name", "authors", "kind"):
             if (noted := getattr(entry, name)) != (said := getattr(told, name)):
                 finding.wrong.append(
-                    f"{where} says {name} {shown_ascii(said)}, the log {shown_ascii(noted)}; {REMEDY}"
+                    f"{where} says {name} {shown_ascii(said)}, but the log {shown_ascii(noted)}; {REMEDY}"
                 )
     finding.told = f"{len(entries)} are what was added"
     return finding
@@ -255,7 +256,7 @@ def _results(board: Board, found: CheapChecks) -> Finding:
             continue
         where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
         odd = [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
-        # Results without a build are older than the chain.
+        # Results without a build are from before the log had a chain.
         if result.get("build") is None and found.chained(_verified_at(found, entry)):
             odd.append(f"{where} does not say with which build it was made; {REMEDY}")
         finding.wrong += odd
@@ -432,8 +433,8 @@ def _nonces(board: Board, found: CheapChecks) -> Finding:
             finding.wrong.append(f"{where} is the hash of a commit that held another log; {REMEDY}")
         elif decided:
             finding.wrong.append(
-                f"{where} is the hash of a commit made before line {decided[0]}, which it decides: it"
-                " was known; withdraw what was added by then"
+                f"{where} is the hash of a commit made before line {decided[0]}, which it decides, so"
+                " it was known; withdraw what was added by then"
             )
         else:
             held += 1
@@ -443,7 +444,7 @@ def _nonces(board: Board, found: CheapChecks) -> Finding:
     return finding
 
 
-# --- what takes time ----------------------------------------------------------------------------------------
+# --- the slow checks ----------------------------------------------------------------------------------------
 
 
 def audit(
@@ -453,7 +454,7 @@ def audit(
     tell: Callable[[Finding], Any] = lambda finding: None,
     progress: Callable[[BoardEntry], Any] = lambda entry: None,
 ) -> bool:
-    """Make all checks; return True if nothing is wrong.
+    """Run all checks; return True if nothing is wrong.
 
     Parameters
     ----------
@@ -584,19 +585,19 @@ def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]
             continue
         finding.wrong += [f"{where} differs in {what}; verify {entry.id} again" for what in compared.far]
         same, bits = same + (not compared.far), bits + compared.same
-    finding.told = f"{same} results are what the submissions get, {bits} of them to the bit"
+    finding.told = f"{same} results were reproduced, {bits} of them to the bit"
     for what in (*_links(board, found), *_references(found)):
         finding.wrong.append(what)
     return finding
 
 
 def _links(board: Board, found: CheapChecks) -> Iterator[str]:
-    """Yield policies that act alike without being noted, or are noted and do not."""
+    """Yield policies that act alike but are not noted as alike, and those noted that do not act alike."""
     neighbours = Neighbours(board)
     for entry in found.state.entries.values():
         if (entry.protocol, entry.id) not in found.results:
             continue
-        # It was compared with all that had been verified by then.
+        # The entry was compared with all that had been verified by then.
         line = _verified_at(found, entry)
         noted = {like.id: like for like in entry.alike}
         for other in others(found.state, entry):
@@ -622,7 +623,7 @@ def _references(found: CheapChecks) -> Iterator[str]:
         returns = play(
             env_id, make_controller(env_id, reference.controller), range(first, first + REFERENCE_EPISODES)
         )
-        # Rare falls may be missing from these episodes: take at least the spread of the many in the log.
+        # Rare falls may be missing from these episodes: use at least the spread of all those in the log.
         spread = max(returns.std(), reference.error * reference.episodes**0.5)
         error = (spread**2 / len(returns) + reference.error**2) ** 0.5
         if abs(returns.mean() - reference.mean) > SIGMAS * error:

@@ -122,7 +122,7 @@ class Board:
             )
 
     def read(self) -> BoardState:
-        """Return the state that follows from the log; others may be writing to it.
+        """Return the state that follows from the log; other processes may be writing to it.
 
         Raises
         ------
@@ -163,7 +163,7 @@ class Board:
     def change(self) -> Iterator[tuple[BoardState, Callable[..., None]]]:
         """Hold the board's lock; give its state and a function that appends an event to the log.
 
-        Others wait meanwhile. Temporary files left by a kill are removed.
+        Other processes wait meanwhile. Temporary files left by a kill are removed.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with store.named(self.log), locked(self.log) as log:
@@ -188,9 +188,9 @@ class Board:
         """Open the missing boards, or begin the next protocol; return the protocol's number.
 
         Environments without a board under the current protocol join it, with today's scale, and nothing else
-        changes. If there are none, or if the rules of the others have changed, the next protocol begins: it
-        freezes today's scale, and all that is verified or pending has to be verified under it. If the log
-        does not state the scale of its current protocol, that is added instead.
+        changes. If all have a board, or if the rules of existing boards have changed, the next protocol
+        begins: it freezes today's scale, and all that is verified or pending has to be verified under it. If
+        the log does not state the scale of its current protocol, that scale is added instead.
         """
         with self.change() as (state, append):
             return self._open(state, append)
@@ -236,7 +236,7 @@ class Board:
         Raises
         ------
         BoardError
-            If its board is frozen, or its files change while they are copied.
+            If its board is frozen, or if its files change while they are copied.
         """
         id = id_of(submission)
         with self.change() as (state, append):
@@ -247,7 +247,9 @@ class Board:
                 raise BoardError(f"the board of {submission.env} is frozen: {reason}")
             known = state.entries.get(id)
             if known and known.digest != submission.digest:
-                raise BoardError(f"{id} is taken by other files; change something, such as the description")
+                raise BoardError(
+                    f"the id {id} is taken by other files; change something, such as the description"
+                )
             if known is None or known.state in ("rejected", "withdrawn"):
                 self._copy(submission, self.submission(id))
                 append(
@@ -265,11 +267,11 @@ class Board:
         for path in sorted(submission.folder.iterdir()):
             (new / path.name).write_bytes(read_plain(path, protocol.FOLDER_BYTES))
         if load(new).digest != submission.digest:
-            raise BoardError(f"{submission.folder} changes while it is read; try again when it is finished")
+            raise BoardError(f"{submission.folder} changed while it was read; try again when it is finished")
         for path in new.iterdir():
             store.to_disk(path)
         store.to_disk(new)
-        _remove(place)  # has no entry: adding it was interrupted, or it was rejected
+        _remove(place)  # without an entry: adding was interrupted, or the submission was rejected
         os.rename(new, place)
         store.to_disk(place.parent)
 
@@ -287,7 +289,7 @@ class Board:
         Raises
         ------
         BoardError
-            If the nonce is empty, not plain text, or was published before, so that it was known.
+            If the nonce is empty, not plain text, or was published before, so that it is known.
         """
         if not re.fullmatch(r"[!-~]{1,200}", nonce):
             raise BoardError(
@@ -306,7 +308,7 @@ class Board:
         """Keep a result, unless the submission is no longer pending.
 
         It replaces the result of the same authors under the same name on the same board, unless the
-        submission acts like an earlier one: submitting the same again brings no second chance.
+        submission acts like an earlier one: submitting the same policies again brings no second chance.
 
         Parameters
         ----------
@@ -315,7 +317,7 @@ class Board:
         result : mapping
             What was verified.
         alike : mapping of str to Alike or None
-            The submissions it was compared with, by id, and how near they are; None if not alike.
+            The submissions it was compared with, by id, and how close they are; None if not alike.
 
         Returns
         -------
@@ -360,7 +362,7 @@ class Board:
             good.
         """
         if not reason.strip():
-            raise BoardError("a reason is needed, which the page shows for good, such as 'asked for'")
+            raise BoardError("give a reason, such as 'asked for'; the page shows it for good")
         with self.change() as (state, append):
             if state.entry(id).state == "withdrawn":
                 raise BoardError(f"{id} was withdrawn before")
@@ -368,7 +370,7 @@ class Board:
 
     @contextmanager
     def claimed(self, id: str) -> Iterator[bool]:
-        """Return whether a submission is free to verify, and lock it if so."""
+        """Yield whether a submission is free to verify, and lock it if so."""
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
         with ExitStack() as stack:
             try:
@@ -376,7 +378,7 @@ class Board:
                 stack.callback(os.close, file)
                 free = lock(file, wait=False)
             except OSError:
-                free = True  # verifying it will find the error
+                free = True  # the verification will report the error
             yield free
 
 
@@ -390,7 +392,8 @@ def current(state: BoardState, what: str) -> Protocol:
         )
     if odd := different(found):
         raise BoardError(
-            f"this version of lag_envs cannot {what} a board of protocol {state.number}: {odd[0]} differ; "
+            f"this version of lag_envs cannot {what} a board of protocol {state.number}, whose {odd[0]} "
+            "differ; "
             "`lag-envs leaderboard open` begins the next protocol, under which everything is verified again"
         )
     return found

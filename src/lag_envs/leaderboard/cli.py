@@ -82,17 +82,17 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
             metavar="N",
             type=count,
             default=os.cpu_count() or 1,
-            help="submissions verified side by side (default: one per core)",
+            help="submissions to verify in parallel (default: one per core)",
         )
         one.add_argument(
             "--ray",
             metavar="ADDRESS",
-            help="verify on a Ray cluster: its address, auto for a running one, local for one made here",
+            help="verify on a Ray cluster: its address, auto for a running one, local to start one here",
         )
 
-    one = action("add", "add submissions, and verify all pending ones that have a nonce", _add)
+    one = action("add", "add submissions, and verify all pending submissions that have a nonce", _add)
     one.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="a submission")
-    one.add_argument("--nonce", metavar="VALUE", help="publish this nonce after they are added")
+    one.add_argument("--nonce", metavar="VALUE", help="publish this nonce after adding the submissions")
     source(one)
     parallel_options(one)
     one = action("nonce", "publish a nonce, and verify all that was added before", _nonce)
@@ -100,22 +100,22 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "value",
         metavar="VALUE",
         nargs="?",
-        help="ideally one that nobody can choose, such as the next pulse of a public beacon (default: the"
-        " hash of the last commit, which must contain the board as it is)",
+        help="a nonce, ideally one that nobody can choose, such as the next pulse of a public beacon"
+        " (default: the hash of the last commit, which must contain the board as it is)",
     )
     source(one)
     parallel_options(one)
     one = action("list", "show the ranking, and the state of all other submissions", _list)
     one.add_argument("env", metavar="ENV", nargs="?", help="only this environment")
-    one = action("show", "show all about one submission", _show)
+    one = action("show", "show everything about one submission", _show)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
-    one.add_argument("--json", action="store_true", help="as JSON, with curves, profile and replays")
+    one.add_argument("--json", action="store_true", help="print JSON, with curves, profile and replays")
     one.add_argument(
-        "--protocol", metavar="N", type=count, help="on the board of this protocol (default: the current)"
+        "--protocol", metavar="N", type=count, help="protocol of the board (default: the current one)"
     )
     one = action("withdraw", "take a submission off the board", _withdraw)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
-    one.add_argument("--reason", metavar="TEXT", required=True, help="shown on the page")
+    one.add_argument("--reason", metavar="TEXT", required=True, help="the reason, which the page shows")
     one = action("audit", "check that nothing on the board has changed since it was added", _audit)
     one.add_argument(
         "--all", action="store_true", help="verify every result again, instead of a few episodes (minutes)"
@@ -124,11 +124,13 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "--pin", metavar="FILE", type=Path, help="pin to check the log against (default: the release's)"
     )
     one = action("pin", "write the log's head into a file that ships with a release", _pin)
-    one.add_argument("file", metavar="FILE", nargs="?", type=Path, help="default: that of this package")
+    one.add_argument(
+        "file", metavar="FILE", nargs="?", type=Path, help="file to write (default: the package's)"
+    )
     one = action(
         "open",
-        "open boards for environments that have none; otherwise begin the next protocol: freeze the scale as "
-        "it is now; the next nonce verifies everything again under it",
+        "open boards for environments that have none, or else begin the next protocol, which freezes the "
+        "current scale; the next nonce then verifies everything again",
         _open,
     )
     one = action("build", "write the page", _build)
@@ -136,11 +138,11 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "out", metavar="OUT", nargs="?", type=Path, default=Path("site"), help="folder (default: site)"
     )
     one.add_argument(
-        "--url", metavar="ADDRESS", default="", help="its future address, for link previews and the feed"
+        "--url", metavar="ADDRESS", default="", help="future address of the page, for previews and the feed"
     )
-    one = action("serve", "write the page into a temporary folder and show it to this machine", _serve)
+    one = action("serve", "write the page into a temporary folder and serve it to this machine only", _serve)
     one.add_argument(
-        "--port", metavar="N", type=int, default=8000, help="port; 0 for any that is free (default: 8000)"
+        "--port", metavar="N", type=int, default=8000, help="port; 0 for any free port (default: 8000)"
     )
 
 
@@ -152,12 +154,12 @@ def run_leaderboard(args: argparse.Namespace) -> int:
         if args.action in ("add", "nonce"):
             resume = f"`lag-envs leaderboard add{Board(args.board).option}`"
             again = "the same command" if args.action == "add" else resume
-            print(f"interrupted; what is done is kept, {again} resumes", file=sys.stderr)
+            print(f"interrupted; finished work is kept, and {again} resumes", file=sys.stderr)
         raise
 
 
 def _existing(args: argparse.Namespace) -> Board:
-    """Return the board that is named; raise a BoardError if there is none."""
+    """Return the board that the arguments name; raise a BoardError if there is none."""
     board = Board(args.board)
     board.require()
     return board
@@ -182,7 +184,7 @@ def _add(args: argparse.Namespace) -> int:
             continue
         added.append(entry.id)
         if entry.state != "pending":
-            print(f"{entry.id}: is there already, {entry.state}")
+            print(f"{entry.id}: is already on the board, {entry.state}")
     if not there and board.exists():
         print(f"{board.folder} is a new board")
     if args.nonce is not None:
@@ -205,7 +207,7 @@ def _nonce(args: argparse.Namespace) -> int:
 
 
 def _publish(board: Board, value: str | None, source: str) -> None:
-    """Publish a nonce; a commit's hash as such."""
+    """Publish a nonce; the hash of a commit is published with its source."""
     from lag_envs.leaderboard.audit import head_of
 
     if value is None:
@@ -218,7 +220,7 @@ def _publish(board: Board, value: str | None, source: str) -> None:
     board.publish(value, source)
     print(f"nonce: {value}")
     if not source:
-        print("it names no public source (--source), so an audit will not accept it", file=sys.stderr)
+        print("the nonce names no public source (--source), so an audit will not accept it", file=sys.stderr)
 
 
 def _open(args: argparse.Namespace) -> int:
@@ -231,9 +233,9 @@ def _open(args: argparse.Namespace) -> int:
         print("\n".join(env_id for env_id in after.protocols[number].scales if env_id not in old))
         print(f"joined protocol {number}; what was verified under it stays")
         return 0
-    print(f"protocol {number}; to be verified under it: {waiting}")
+    print(f"protocol {number}; submissions to verify under it: {waiting}")
     if waiting:
-        print(f"commit and push, then `lag-envs leaderboard nonce{board.option}`")
+        print(f"commit and push, then run `lag-envs leaderboard nonce{board.option}`")
     return 0
 
 
@@ -307,7 +309,7 @@ def _some(board: Board) -> BoardState:
     try:
         state = board.read()
     except BoardError:
-        sound(board)  # which may know more
+        sound(board)  # which may say more about it
         raise
     if not state.entries:
         if parse(read_log(board.log))[1]:

@@ -2,8 +2,8 @@
 
 A score counts from 0 (random actions) to 1 (the best policy known), so a record or a disaster on one board
 weighs no more than that board. A board without the agent counts 0, as if it had acted at random there, so
-nobody gains by leaving out the hard ones. The number of its boards is shown beside it, and its profile: the
-share of the boards on which it reaches each score.
+nobody gains by leaving out the hard ones. Two more results are shown beside the score: the number of the
+agent's boards, and its profile, which is the share of the boards on which it reaches each score.
 
 A board counts once somebody is ranked on it. An agent is identified by name and authors.
 """
@@ -50,7 +50,7 @@ def combined(boards: Mapping[str, Mapping[AgentIdentity, AgentScore]]) -> list[d
     -------
     list of dict
         ``name``, ``authors``, ``kind``; ``score`` and its bootstrap ``interval`` of 95 %; ``boards``, the
-        number it is on, ``of`` the number there are; ``there``, its mean score on those it is on;
+        number it is on, ``of`` the number there are; ``there``, its mean score on the boards it is on;
         ``profile``, pairs of a score and the share of all boards on which it has at least that.
     """
     counted = {env_id: found for env_id, found in boards.items() if found}

@@ -2,7 +2,7 @@
 
 From a checkout's folder ``leaderboard``, it writes the agents with the best combined scores into README.md,
 and each board's best agents and success criterion into ``docs/leaderboard.md``. The texts depend on the files
-alone, so a test makes them again and compares.
+alone, so a test generates them again and compares.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def generated(project: Path) -> dict[Path, str]:
 
 
 def together(data: dict[str, Any]) -> str:
-    """Return a table of the best agents over all boards, and of the best learned one if it is not in it."""
+    """Return a table of the best agents over all boards, with the best learned one in any case."""
     every = list(enumerate(data["combined"], 1))
     shown = every[:BEST] + [one for one in every[BEST:] if one[1]["kind"] == "learned"][:1]
     if not shown:
@@ -95,7 +95,7 @@ def _scored(row: dict[str, Any], digits: int = 4) -> str:
 def goals() -> str:
     """Return a table of the success criteria.
 
-    The board's log freezes the tasks' texts as rules, so an idiom of theirs is replaced only here.
+    The board's log freezes the tasks' texts as rules, so one of their phrases is replaced only here.
     """
     texts = {
         env_id: TASKS[env_id].goal.text.replace("until it is so for good", "until it stays there")

@@ -1,7 +1,7 @@
 """The best human drives: links in the board's ``drives.txt``, recomputed whenever the page is built.
 
-A line is a link and the driver's name, with white space between. Empty lines and those that begin with ``# ``
-are ignored.
+A line is a link and the driver's name, with white space between them. Empty lines and lines that begin with
+``# `` are ignored.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def best_drives(folder: Path) -> dict[str, list[dict[str, Any]]]:
             raise BoardError(f"{where}: {error}; remove the line") from error
         if not played.true:
             raise BoardError(
-                f"{where}: the claim is false: {drive.claimed!r} is claimed, {played.total!r} is true"
+                f"{where}: the claim is false: {drive.claimed!r} is claimed, but {played.total!r} is true"
             )
         if not played.finished:
             raise BoardError(f"{where}: the drive stops before its episode's end; remove the line")

@@ -1,7 +1,7 @@
 """Turn models of Stable-Baselines3 into a submission, and prove that both act alike.
 
 A model's file runs code when it is loaded. Export only your own models. Networks that
-``python -m agents.ppo`` left are arrays, which are read without running anything and taken as they are.
+``python -m agents.ppo`` left are arrays, which are read without running anything and used as they are.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class ExportError(UserError):
 
 @dataclass
 class Source:
-    """A model's files, what is known of its training, and how many observations it sees side by side."""
+    """A model's files, what is known of its training, and how many observations it sees at once."""
 
     model: Path
     normalise: Path | None = None
@@ -73,7 +73,7 @@ def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
     ----------
     paths : sequence of Path
         An SB3 ``.zip``; a folder with ``model.zip``, and ``vecnormalize.pkl`` and ``result.json`` where there
-        are any; or a folder in which such folders lie.
+        are any; or a folder that contains such folders.
     normalise : sequence of Path
         For each of the paths, if all are files, the pickled ``VecNormalize``.
     """
@@ -123,14 +123,14 @@ def algorithm_of(source: Source) -> str:
     names = [name for name, (*_, known) in ALGORITHMS.items() if known == module]
     if not names:
         raise ExportError(
-            f"{file} has a policy of {module}, which is not known; name one that it is like with --algo: "
+            f"{file} has a policy of {module}, which is not known; name a similar algorithm with --algo: "
             + ", ".join(ALGORITHMS)
         )
     return "a2c" if "a2c" in names and "n_epochs" not in data else names[0]
 
 
 def _name(source: Source, algo: str | None) -> str:
-    """Return what a model's learner is called."""
+    """Return the name of a model's learner."""
     if arrays_of(source.model) is None:
         return ALGORITHMS[algo or algorithm_of(source)][1]
     words = (source.result or {}).get("algo", "ppo").split("_")
@@ -152,7 +152,7 @@ def load_model(source: Source, algo: str) -> tuple[Any, Any]:
         normalise = None if source.normalise is None else pickle.loads(source.normalise.read_bytes())
     except ImportError:
         raise
-    except Exception as error:  # whatever a file that is no model leads to
+    except Exception as error:  # a file that is not a model may raise anything
         raise ExportError(f"{source.model} cannot be read: {type(error).__name__}: {error}") from error
     return model, normalise if normalise is not None and normalise.norm_obs else None
 
@@ -189,18 +189,18 @@ def convert(
     Parameters
     ----------
     model : BaseAlgorithm
-        A model of Stable-Baselines3; of its distribution the mode is taken.
+        A model of Stable-Baselines3, which acts by the mode of its distribution.
     task : Task
         The task.
     normalise : VecNormalize, optional
         Its normalisation of observations.
     frames : int
-        The number of observations that it sees side by side, as with `VecFrameStack`.
+        The number of observations that it sees at once, as with `VecFrameStack`.
 
     Raises
     ------
     ExportError
-        For a policy that is not a network of fully connected layers, or of other spaces.
+        For a policy that is not a network of fully connected layers, or that has other spaces.
     """
     from gymnasium import spaces
 
@@ -231,7 +231,7 @@ def convert(
     if extractor != "FlattenExtractor":
         raise ExportError(f"observations must go to the network as they are, not through a {extractor}")
     layers = [layer for part in parts for layer in _flat(part)]
-    if type(layers[-1]).__name__ == "Hardtanh":  # the mean's limit under SAC's and TQC's gSDE
+    if type(layers[-1]).__name__ == "Hardtanh":  # the limit of the mean under gSDE, in SAC and TQC
         last = layers.pop()
         if last.max_val != -last.min_val:
             raise ExportError(f"the last layer's clipping must be symmetric, got {last}")
@@ -280,10 +280,11 @@ def _flat(module: Any) -> list[Any]:
 def difference(policy: ModelPolicy, agent: Any, env_id: str) -> tuple[float, int]:
     """Return the largest difference of a model's actions and an agent's, and the number of observations.
 
-    Half of the observations are on the way: of episodes in which the model acts, and of some in which actions
-    are random. The others are random, as far out as those; beyond, float32 rounds too much.
+    Half of the observations come from episodes, in most of which the model acts, and in some of which actions
+    are random. The others are random numbers in the same range; beyond it, float32 rounds too much.
 
-    Where the model chooses between actions and two are worth the same to float32's rounding, either is right.
+    Where the model chooses between actions and two are worth the same within float32's rounding, either is
+    right.
     """
     import gymnasium as gym
 
@@ -321,23 +322,23 @@ def difference(policy: ModelPolicy, agent: Any, env_id: str) -> tuple[float, int
 
 
 def _as_good(worth: NDArray, chosen: NDArray) -> NDArray[np.bool_]:
-    """Return in which rows the chosen one is worth as much as the best, to float32's rounding."""
+    """Return in which rows the chosen action is worth as much as the best, within float32's rounding."""
     lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
     return lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))
 
 
 @dataclass
 class Exported:
-    """A model as a submission has it.
+    """A model in the form of a submission.
 
     Attributes
     ----------
     table, arrays : mapping
         The table ``[policy]`` and its arrays.
     agent : object
-        What acts, as on the board.
+        The agent, as on the board.
     policy : ModelPolicy or None
-        What it was made of; a file that holds arrays has no model.
+        The model it was made from; None for a file that holds arrays.
     """
 
     table: dict[str, Any]
@@ -347,7 +348,7 @@ class Exported:
 
 
 def exported(source: Source, env: str, algo: str | None = None) -> Exported:
-    """Return a model of an environment as a submission has it; raise ExportError where it cannot be one."""
+    """Return a model of an environment in the form of a submission; raise ExportError if that fails."""
     policy = None
     if (ready := arrays_of(source.model)) is not None:
         if algo:
@@ -367,7 +368,7 @@ def exported(source: Source, env: str, algo: str | None = None) -> Exported:
 def own_agent(
     source: Source, env: str, task: Task, table: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> Any:
-    """Return the agent of `arrays_of`, for any task; raise ExportError where it does not fit."""
+    """Return the agent of `arrays_of`, for any task; raise ExportError if it does not fit."""
     try:
         return _agent(MLP(env, accepted(MLP.table, dict(table), POLICY), task), env, arrays)
     except Refused as error:
@@ -406,14 +407,14 @@ def export(
     sources : sequence of Source
         The models.
     folder : Path
-        Where to; must not exist.
+        The folder to write, which must not exist.
     authors, license, name, code, description
-        See `Submission`; the name is the algorithm's where not given.
+        See `Submission`; by default, the name is that of the algorithm.
     env, env_steps, seconds, hardware
-        Taken from the runs' ``result.json`` where not given; steps from the model, the hardware from this
-        machine where there is none. Seconds are one training's.
+        If not given, these are taken from the runs' ``result.json``; without such a file, the steps are
+        taken from the model and the hardware from this machine. Seconds are those of one training.
     algo : str, optional
-        One of `ALGORITHMS`; found out where not given.
+        One of `ALGORITHMS`; detected if not given.
 
     Returns
     -------
@@ -422,7 +423,7 @@ def export(
     difference : float
         The largest difference of the actions of a model and its export, `DIFFERENCE` at most.
     observations : int
-        For how many observations of each model they were compared.
+        The number of observations for which each model was compared.
 
     Raises
     ------
@@ -483,9 +484,7 @@ def _same(what: str, values: Sequence[Any], option: str) -> Any:
     if not values or None in values:
         raise ExportError(f"the {what} is not known; give {option}")
     if len(set(values)) > 1:
-        raise ExportError(
-            f"the models are of more than one {what}: {', '.join(map(str, sorted(set(values))))}"
-        )
+        raise ExportError(f"the models have more than one {what}: {', '.join(map(str, sorted(set(values))))}")
     return values[0]
 
 
@@ -516,26 +515,26 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
         "models", metavar="MODEL", nargs="+", type=Path,
         help=f"an SB3 .zip; or a folder with {MODEL}, {NORMALISATION}, {RESULT}; or a folder of those",
     )  # fmt: skip
-    add("--author", metavar="NAME", action="append", required=True, help="may be given several times")
+    add("--author", metavar="NAME", action="append", required=True, help="an author; repeatable")
     add("--license", metavar="SPDX", required=True, help="licence of the policies, such as MIT or CC-BY-4.0")
-    add("--output", metavar="FOLDER", type=Path, help="default: ENV-NAME; must not exist")
+    add("--output", metavar="FOLDER", type=Path, help="new folder to write (default: ENV-NAME)")
     add("--env", metavar="ID", help=f"the environment (default: what {RESULT} says)")
-    add("--name", help="as the board shows it (default: the algorithm)")
+    add("--name", help="name on the board (default: the algorithm)")
     add(
         "--normalise", metavar="PKL", nargs="+", type=Path, default=[],
         help="pickled VecNormalize, one for each MODEL that is a file of Stable-Baselines3",
     )  # fmt: skip
     add(
         "--frames", metavar="N", type=int,
-        help="observations that models of Stable-Baselines3 see side by side, as with VecFrameStack "
+        help="observations that models of Stable-Baselines3 see at once, as with VecFrameStack "
         "(default: as recorded, else 1)",
     )  # fmt: skip
-    add("--algo", choices=list(ALGORITHMS), help="of models of Stable-Baselines3 (default: detected)")
-    add("--code", metavar="URL", default="", help="https address of the code it was trained with")
-    add("--description", metavar="TEXT", default="", help="a line about it")
+    add("--algo", choices=list(ALGORITHMS), help="algorithm of the models (default: detected)")
+    add("--code", metavar="URL", default="", help="https address of the training code")
+    add("--description", metavar="TEXT", default="", help="a line about the agent")
     add("--env-steps", metavar="N", type=int, help="steps of one training (default: as recorded)")
     add("--seconds", metavar="S", type=float, help="wall time of one training (default: as recorded)")
-    add("--hardware", metavar="TEXT", help="what it was trained on (default: as recorded, else this machine)")
+    add("--hardware", metavar="TEXT", help="training hardware (default: as recorded, else this machine)")
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -543,7 +542,7 @@ def run_export(args: argparse.Namespace) -> int:
     try:
         import torch
 
-        torch.set_num_threads(1)  # such networks are too small to share out
+        torch.set_num_threads(1)  # the networks are too small to divide the work
         sources = find(args.models, args.normalise)
         for option in ("algo", "frames", "normalise"):
             if getattr(args, option):
@@ -565,7 +564,7 @@ def run_export(args: argparse.Namespace) -> int:
     alike = f"largest difference of an action from the models': {off:.1e}, over {count} observations of each"
     print(
         f"{submission.folder}: {submission.env}, {submission.name}, {len(submission.policies)} policies\n"
-        f"{alike if count else 'their numbers are taken over as they are'}\n"
+        f"{alike if count else 'their numbers are used as they are'}\n"
         f"digest {submission.digest}"
     )
     return 0

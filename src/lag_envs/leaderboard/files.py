@@ -34,7 +34,7 @@ def read_plain(path: Path, most: int) -> bytes:
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If there is no such file.
     OSError
         If it is not a plain file, is larger, or cannot be read.
     """

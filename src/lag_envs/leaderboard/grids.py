@@ -32,23 +32,24 @@ class GridTable(PolicyTable):
         if len(set(self.axes)) < len(self.axes):
             raise ValueError("axes must differ")
         if self.kind == "action" and "actions" in self.model_fields_set:
-            raise ValueError("actions means nothing in a table of actions; leave it out")
+            raise ValueError("actions has no meaning in a table of actions; leave it out")
         if self.mirror not in ("", *(set(self.axes) - {"time"})):
             raise ValueError(f"mirror must be one of the axes and not time, not {shown_ascii(self.mirror)}")
         return self
 
 
 class GridArchitecture(Architecture):
-    """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, those at the edge.
+    """Numbers at the nodes of a grid, interpolated linearly along every axis; beyond it, its edge counts.
 
-    In the table: `axes`, a list of the axes: a state by its name (`lag-envs info ID`), ``target``, a state
-    relative to the target as ``"x - target"``, or ``time`` [s] since the episode's start. An angle that is
-    observed by its cosine and sine lies in [-π, π].
+    In the table: `axes`, the list of the axes, each of which is a state by its name (`lag-envs info ID`),
+    ``target``, a state relative to the target as ``"x - target"``, or ``time`` [s] since the episode's start.
+    An angle that is observed by its cosine and sine lies in [-π, π].
 
-    `kind` is "action" or "value". A table of actions is read off. A table of values gives the return still to
-    come from the state in which a step's motion ends (the mean over a random kick that may follow). The
-    action is the one with the largest reward + value one step ahead, by the exact model of the undisturbed
-    environment: the best of `actions` evenly spaced ones, refined around it, or the best of the listed ones.
+    `kind` is "action" or "value". A table of actions gives the action itself. A table of values gives the
+    return still to come from the state in which a step's motion ends (the mean over a random kick that may
+    follow). The action is the one with the largest reward + value one step ahead, by the exact model of the
+    undisturbed environment: the best of `actions` evenly spaced ones, refined around it, or the best of the
+    listed ones.
 
     `mirror`, optional, names an axis. If its coordinate is negative, the mirror image is looked up: all signs
     change except that of time, and so does the action's, unless the control is a drag, which has no sign.
@@ -78,7 +79,7 @@ class GridArchitecture(Architecture):
         self.axes = tuple(table.axes)
         for axis in self.axes:
             if axis not in known:
-                raise Refused(f"{POLICY}: axes must be of {', '.join(known)}; got {shown_ascii(axis)}")
+                raise Refused(f"{POLICY}: axes must be among {', '.join(known)}; got {shown_ascii(axis)}")
         self.kind, self.actions, mirror = table.kind, table.actions, table.mirror
         #: For each axis, its coefficients of (*states, target, time): 0, 1 or -1.
         self.sums = np.zeros((len(self.axes), len(names) + 2))

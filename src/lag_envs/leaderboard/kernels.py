@@ -1,6 +1,6 @@
 """Compiled loops of the policies: each row's result depends on that row alone, to the bit.
 
-A library's matrix product promises neither that, nor the same bits for another number of rows or threads.
+A library's matrix product guarantees neither this, nor the same bits for another number of rows or threads.
 Sums are taken in order and not fused, so that they are the same on every machine.
 """
 

@@ -32,7 +32,7 @@ LOG = "board.jsonl"
 MOST = 2**26
 STATES = ("pending", "verified", "rejected", "superseded", "withdrawn")
 REMEDY = "restore it from version control"
-#: All of one length and in UTC, so that they sort as text, and none so far ahead that no clock gets past it.
+#: Times all have one length and are in UTC, so that they sort as text; none is too far ahead for any clock.
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
 
 
@@ -45,7 +45,7 @@ class BoardError(UserError):
 
 def _timestamp(text: str) -> str:
     if not re.fullmatch(TIME, text):
-        raise ValueError("a time is needed such as 2026-01-31T12:00:00.000000+00:00, before the year 2200")
+        raise ValueError("a time before the year 2200 is needed, such as 2026-01-31T12:00:00.000000+00:00")
     datetime.fromisoformat(text)
     return text
 
@@ -71,7 +71,7 @@ class Event(Strict):
 
 
 class LoggedScale(Strict):
-    """The mean returns that are scores 0 and 1, frozen when a protocol begins."""
+    """The mean returns with scores 0 and 1, frozen when a protocol begins."""
 
     random: Number
     best: Number
@@ -152,7 +152,7 @@ class Alike(Strict):
 
 
 class Verified(Event):
-    """A submission was verified and its result kept; it replaces its authors' others of the same name."""
+    """A submission was verified and its result kept; it replaces the same authors' others of that name."""
 
     event: Literal["verified"]
     id: Id
@@ -241,7 +241,7 @@ def parse(log: bytes) -> tuple[list[LogLine], bytes]:
             if chained and event.prev is None:
                 raise _damaged(number, "holds no hash of the lines before it")
             if event.prev is not None and event.prev != before.hexdigest():
-                raise _damaged(number, "is not what followed the lines before it: one of these was changed")
+                raise _damaged(number, "does not follow the lines before it: one of those was changed")
             chained = event.prev is not None
             lines.append(LogLine(number, event))
         before.update(line if last else line + b"\n")
@@ -252,7 +252,7 @@ def _damaged(number: int, what: str) -> BoardError:
     return BoardError(f"{LOG}, line {number} {what}; {REMEDY}, or remove what a merge left there")
 
 
-# --- what follows from them ---------------------------------------------------------------------------------
+# --- the state that follows ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -344,8 +344,8 @@ class BoardState:
     def first(self, entry: BoardEntry) -> BoardEntry | None:
         """Return the first submission that acts like this one; None if it is the first itself.
 
-        Likeness is noted with the one that was verified later; the one that was added later is linked. Links
-        are followed to their end.
+        Likeness is noted in the entry that was verified later, but links lead from the submission that was
+        added later to the earlier one. Links are followed to their end.
         """
         board = self.boards[entry.protocol]
         others = {like.id for like in entry.alike}
@@ -397,7 +397,7 @@ def _begin(state: BoardState, event: Protocol, line: int) -> None:
     known = state.number in state.protocols
     wanted = state.number + 1 if known or not state.number else state.number
     if event.number != wanted:
-        raise ValueError(f"protocol {event.number} begins where {wanted} would be the next")
+        raise ValueError(f"protocol {event.number} begins, but the next would be {wanted}")
     state.protocols[event.number] = event
     if not known:  # the first protocol, or one that began before its line was written
         state.number = event.number
@@ -418,9 +418,9 @@ def _begin(state: BoardState, event: Protocol, line: int) -> None:
 def _join(state: BoardState, event: Opened) -> None:
     known = state.protocols.get(state.number)
     if known is None or event.number != state.number:
-        raise ValueError(f"boards join protocol {event.number}, the current is {state.number}")
+        raise ValueError(f"boards join protocol {event.number}, but the current one is {state.number}")
     if there := sorted(set(event.scales) & set(known.scales)):
-        raise ValueError(f"{there[0]} joins protocol {event.number}, and has a board there already")
+        raise ValueError(f"{there[0]} joins protocol {event.number}, but already has a board there")
     rules = known.rules.model_copy(update={"success": event.success | known.rules.success})
     scales, references = known.scales | event.scales, event.references | known.references
     state.protocols[state.number] = known.model_copy(
@@ -433,7 +433,7 @@ def _add(state: BoardState, event: Added, line: int) -> None:
         state.number = 1
     if event.protocol != state.number:
         raise ValueError(
-            f"{event.id} is added under protocol {event.protocol}, the current is {state.number}"
+            f"{event.id} is added under protocol {event.protocol}, but the current one is {state.number}"
         )
     known = state.entries.get(event.id)
     told = {key: getattr(event, key) for key in ("env", "protocol", "name", "kind", "digest")}
@@ -443,10 +443,10 @@ def _add(state: BoardState, event: Added, line: int) -> None:
         )
         return
     if known.state not in ("rejected", "withdrawn"):
-        raise ValueError(f"{event.id} is added, but is already there, {known.state}")
+        raise ValueError(f"{event.id} is added, but is already on the board, {known.state}")
     if any(getattr(known, key) != value for key, value in told.items()):
         raise ValueError(f"{event.id} is added again with other data")
-    # Coming back does not change the episodes, nor the result if there is one.
+    # Adding it again changes neither the episodes nor the result, if there is one.
     back = replace(known, state="verified" if known.sha256 else "pending", reason="")
     newer = [
         other.id
@@ -461,7 +461,7 @@ def _add(state: BoardState, event: Added, line: int) -> None:
 def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
     known = state.entries.get(event.id)
     if known is None:
-        raise ValueError(f"{event.id} is {event.event}, and was never added; restore the line that adds it")
+        raise ValueError(f"{event.id} is {event.event}, but was never added; restore the line that adds it")
     if isinstance(event, Withdrawn):
         if known.state == "withdrawn":
             raise ValueError(f"{event.id} is withdrawn, but was withdrawn already")
@@ -493,7 +493,7 @@ def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
 
 
 def same_agent(entry: BoardEntry, other: BoardEntry) -> bool:
-    """Return whether two are the same authors' of the same name, on the same board."""
+    """Return whether two entries have the same authors and name, on the same board."""
     return (entry.env, entry.name, sorted(entry.authors)) == (other.env, other.name, sorted(other.authors))
 
 

@@ -47,14 +47,14 @@ def bin_centres(bins: int) -> Array:
 
 
 def stacked(observation: NDArray, frames: int, before: NDArray | None = None, start: Any = None) -> NDArray:
-    """Return an episode's last observations side by side, the oldest first; before its first there are zeros.
+    """Return an episode's last observations side by side, the oldest first; earlier ones are zeros.
 
     Parameters
     ----------
     observation : ndarray, shape (..., n_observation)
-        The newest.
+        The newest observation.
     frames : int
-        How many to return.
+        The number of observations to return.
     before : ndarray, shape (..., frames * n_observation), optional
         The result of the step before; without it, all episodes begin.
     start : array_like of bool, shape (...), optional
@@ -105,7 +105,7 @@ class MLPTable(NetworkTable):
     @model_validator(mode="after")
     def _framed(self) -> Self:
         if self.frames == 1 and "padding" in self.model_fields_set:
-            raise ValueError("padding means nothing without frames; leave it out")
+            raise ValueError("padding has no meaning without frames; leave it out")
         return self
 
 
@@ -135,7 +135,7 @@ class Network(Architecture):
         if self.head.choices:
             self.schema = 2
             if given:
-                raise Refused(f"{POLICY}: {min(given)} means nothing where actions are listed; leave it out")
+                raise Refused(f"{POLICY}: {min(given)} has no meaning where actions are listed; leave it out")
         elif not self.bins and self.squash is None:
             raise Refused(f"{POLICY}: squash or bins is missing")
         widths = [features, *table.hidden, self.head.size * (self.bins or 1)]
@@ -144,7 +144,7 @@ class Network(Architecture):
         self.layers = len(widths) - 1
         numbers = sum(math.prod(map(int, shape)) for shape in self.arrays.values())
         if numbers > protocol.NUMBERS:
-            raise Refused(f"the network has {numbers} numbers, at most {protocol.NUMBERS} are accepted")
+            raise Refused(f"the network has {numbers} numbers; at most {protocol.NUMBERS} are accepted")
         if self.normalise:
             self.arrays |= {"obs_mean": (wide,), "obs_var": (wide,)}
 

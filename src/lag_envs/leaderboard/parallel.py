@@ -26,7 +26,7 @@ def map_submissions(
     folders : sequence of Path
         The submissions.
     jobs : int
-        Parallel processes; 1 for none besides this one.
+        Number of parallel processes; 1 stands for this process alone.
     ray : str, optional
         Address of a Ray cluster, "auto" for a running one, "local" for one on this machine. This package and
         the submissions' files are sent to its machines, which need the package's dependencies.
@@ -50,7 +50,7 @@ def map_submissions(
             for folder in folders:
                 try:
                     files = read_files(folder)
-                except Refused:  # the function will find so too, which needs no other machine
+                except Refused:  # the function will refuse it too, which needs no other machine
                     yield folder, _caught(function, folder)
                 else:
                     futures[submit(_unpacked, function, folder.name, files)] = folder
@@ -64,7 +64,7 @@ def map_submissions(
 
 
 def with_bar(function: Callable[..., Any], folder: Path) -> Any:
-    """Call a function of a folder and of its progress, which a bar shows on a terminal."""
+    """Call a function with a folder and a callback for its progress, which a bar shows on a terminal."""
     from tqdm import tqdm
 
     with tqdm(

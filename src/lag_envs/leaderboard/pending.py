@@ -25,7 +25,7 @@ class PendingCheck:
     Parameters
     ----------
     entries : dict of str to (digest, nonce)
-        By the name of the submission's folder.
+        The digest and nonce of each submission, by the name of its folder.
     """
 
     entries: Mapping[str, tuple[str, str]]
@@ -97,7 +97,7 @@ def finish(
     board : Board
         The board.
     parallel_map : callable, optional
-        Like `map_submissions` with all but its first two arguments given; one after the other by default.
+        Like `map_submissions`, with only its first two arguments; by default, one after the other.
     tell : callable
         Called with each entry and its outcome.
 
@@ -163,7 +163,7 @@ class Neighbours:
         self._likeness: dict[tuple[str, str], Any] = {}
 
     def alike(self, entry: BoardEntry, result: Mapping[str, Any], other: BoardEntry) -> Alike | None:
-        """Return how near another submission is to one that was just verified; None if they are not alike."""
+        """Return how close another submission is to one just verified; None if they are not alike."""
         from lag_envs.leaderboard.alike import Likeness
         from lag_envs.leaderboard.ranking import policy_error
 

@@ -19,7 +19,7 @@ from lag_envs.tasks import TASKS
 
 Number = Annotated[float, between(-1e6, 1e6)]
 Weight = Annotated[float, between(0.0, 1e6)]
-#: Keys that mean something only where actions lie in a range, and only where they are listed.
+#: Keys that apply only where actions lie in a range, and keys that apply only where they are listed.
 RANGED, LISTED = {"iterations", "guesses", "good", "seed"}, {"cell", "energy"}
 
 
@@ -64,7 +64,7 @@ class PlanAhead(Architecture):
         listed = bool(task.formulas.choices)
         for key in sorted((RANGED if listed else LISTED) & table.model_fields_set):
             where = "are listed" if listed else "lie in a range"
-            raise Refused(f"{POLICY}: {key} means nothing where actions {where}; leave it out")
+            raise Refused(f"{POLICY}: {key} has no meaning where actions {where}; leave it out")
         for key, entries in (("weights", table.weights), ("rest", table.rest)):
             for name in entries:
                 if name not in task.scene.state_names:
@@ -82,7 +82,7 @@ class PlanAhead(Architecture):
         if steps > protocol.MODEL_STEPS:
             raise Refused(
                 f"{POLICY}: renewing plans takes {steps:.0f} steps of the model per step of the environment, "
-                f"at most {protocol.MODEL_STEPS} are allowed; shorten the horizon, or plan less often"
+                f"but at most {protocol.MODEL_STEPS} are allowed; shorten the horizon, or plan less often"
             )
         if not listed:
             self.numbers = table.model_dump(exclude={"architecture", *LISTED}, exclude_none=True)
@@ -94,12 +94,12 @@ class PlanAhead(Architecture):
         width = (table.budget // table.horizon - 1) // count
         if width < 1:
             raise Refused(
-                f"{POLICY}: a search of {table.horizon} steps with {count} actions takes a budget of at "
+                f"{POLICY}: a search of {table.horizon} steps with {count} actions needs a budget of at "
                 f"least {table.horizon * (count + 1)} model steps, got {table.budget}"
             )
         given = table.model_dump(include=table.model_fields_set - {"architecture", "budget"})
         self.numbers = given | {"width": width}
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:
-        """Return a planner without a plan yet."""
+        """Return a planner that has no plan yet."""
         return (beam if self.task.formulas.choices else planner)(self.task, **self.numbers)

@@ -14,7 +14,7 @@ bootstrap intervals of 95 %:
 - The reference that measures luck has a mean that is itself uncertain. Each bootstrap sample therefore draws
   another mean from a normal distribution. The same one is used for all rows, since an error moves them all
   together, each as far as it was corrected (`luck_of`). The reference's own row is moved all the way: after
-  the correction, nothing is left of it but that mean, of other episodes, with its standard error.
+  the correction, only that mean is left of it, which comes from other episodes, with its standard error.
 
 Each row's generator is seeded by its id, so a row's numbers do not depend on the other rows.
 
@@ -58,11 +58,11 @@ class Reference(Protocol):
 
     @property
     def mean(self) -> float:
-        """In other episodes."""
+        """Its mean return in other episodes."""
 
     @property
     def error(self) -> float:
-        """Its standard error."""
+        """Standard error of that mean."""
 
 
 class Chance(NamedTuple):
@@ -155,7 +155,7 @@ def scored(scale: Scale, reference: Reference | None, policies: Sequence[Mapping
 def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the standard error of a policy's corrected mean return, averaged over the policies.
 
-    It is None for a single episode, which shows nothing of the spread.
+    It is None for a single episode, which says nothing about the spread.
     """
     table, error = _corrected(reference, policies)
     if table.shape[1] < 2:
@@ -200,8 +200,8 @@ def compare(x: Scores, y: Scores, x_drawn: Array, y_drawn: Array) -> Chance:
 def ranked(scores: Mapping[str, Scores], drawn: Mapping[str, Array]) -> list[Place]:
     """Return the rows sorted by score, with their ranks.
 
-    A row shares the rank of the row above unless some row of that rank is clearly better: unless the interval
-    of the probability that it does better leaves out one half.
+    A row shares the rank of the row above unless some row of that rank is clearly better, which means that
+    the interval of the probability that it does better excludes one half.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     result : mapping
         The verified result.
     few : int
-        Number of episodes under changed conditions: the first ones.
+        Number of episodes that are also played under changed conditions; they are the first ones.
     scale : Scale
         The environment's.
     scores : Scores
@@ -255,7 +255,7 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     if success:
         low, high = wilson(sum(success), len(success))
         counted = {"rate": sum(success) / len(success), "low": low, "high": high}
-    # Only the first episodes are disturbed: subtract how these differ from all anyway.
+    # Only the first episodes are disturbed: subtract how they differ from all even if undisturbed.
     moved = means - normalised(scale, bare[:, :few].mean(axis=1))
     robustness = _scores(scale, result.get("robustness") or {}, moved)
     # With random kicks, acting more often draws different ones.

@@ -75,7 +75,7 @@ class Claimed(Strict):
 
 
 class VerificationResult(Strict):
-    """What `verify` returns; on a board with `claimed` and `replays`."""
+    """The result of `verify`; on a board, `claimed` and `replays` are added."""
 
     protocol: Count | None = None  # only in old results; otherwise the log has it
     env: EnvId
@@ -168,7 +168,7 @@ def code_digest() -> str:
     return digest_of({name: content.replace(b"\r\n", b"\n") for name, content in code.items()})
 
 
-# --- two of the same ----------------------------------------------------------------------------------------
+# --- comparison ---------------------------------------------------------------------------------------------
 
 
 class VerificationComparison(NamedTuple):

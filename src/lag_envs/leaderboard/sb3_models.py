@@ -23,8 +23,8 @@ class ModelPolicy:
     normalise : VecNormalize, optional
         The normalisation of its observations.
     frames : int
-        The number of observations that it sees side by side, as with `VecFrameStack`: the last ones of each
-        episode; before the first there are zeros.
+        The number of observations that it sees at once, as with `VecFrameStack`: the last ones of each
+        episode, with zeros before the first.
     """
 
     def __init__(self, model: Any, task: Task, normalise: Any = None, frames: int = 1) -> None:

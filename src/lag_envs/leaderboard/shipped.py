@@ -1,8 +1,8 @@
 """The policies that come with the package: the board's best network or table for each environment.
 
 ``python -m lag_envs.leaderboard.shipped`` chooses them from a clone's board and writes them beside this file.
-Together they have at most `MOST` bytes; if the best ones are larger, some are replaced by smaller ones, so
-that the least score per byte is lost. Controllers are in the package anyway.
+Together they have at most `MOST` bytes; if the best ones are larger, some are replaced by smaller ones,
+chosen so that the least score per byte is lost. Controllers are in the package anyway.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def chosen_candidates(of: Iterable[Candidate], most: int = MOST) -> dict[str, Ca
     while sum(c.size for c in best.values()) > most:
         smaller = [c for c in ranked if c.size < best[c.env].size]
         if not smaller:
-            raise UserError(f"there is no choice of policies with at most {most:,} bytes together")
+            raise UserError(f"no choice of policies has at most {most:,} bytes in total")
         least = min(smaller, key=lambda c: (best[c.env].score - c.score) / (best[c.env].size - c.size))
         best[least.env] = least
     return best

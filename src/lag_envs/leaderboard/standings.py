@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def page_data(board: Board) -> dict[str, Any]:
-    """Return `board_data` and what only the page needs: agents that run there, and human drives."""
+    """Return `board_data` and what only the page needs: agents that run on the page, and human drives."""
     from lag_envs.leaderboard.drives import best_drives
     from lag_envs.leaderboard.site.driving import agent
     from lag_envs.leaderboard.submission import load
@@ -103,7 +103,7 @@ def _environment(
         scores = {id: ranking.scored(scale, reference, r["policies"]) for id, r in found.items()}
         drawn = {id: ranking.redrawn(id, each) for id, each in scores.items()}
         first = {id: state.first(entries[id]) for id in found}
-        # Rows that act like an earlier one are shown, but not ranked, and nobody is compared with them.
+        # Rows that act like an earlier one are shown, but are not ranked, and no row is compared with them.
         places = ranking.ranked({id: each for id, each in scores.items() if first[id] is None}, drawn)
         ranks = {place.id: place for place in places}
         for id in sorted(scores, key=lambda id: -float(iqm(scores[id].table.mean(axis=1)))):

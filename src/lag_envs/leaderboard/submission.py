@@ -98,7 +98,7 @@ class Submission(About):
     policies : tuple of (int, SubmittedPolicy)
         Training seed and policy, by increasing seed.
     folder : Path
-        Where it was read.
+        The folder it was read from.
     """
 
     policies: tuple[tuple[int, SubmittedPolicy], ...]
@@ -140,7 +140,7 @@ def _licence(text: str) -> str:
 def _address(code: str) -> str:
     # https://github.com@evil.org leads to evil.org.
     if "@" in urlsplit(code).netloc:
-        raise ValueError("there must be no @ before the first / of the path: it would hide where this leads")
+        raise ValueError("there must be no @ before the first / of the path: it would hide the real address")
     return code
 
 
@@ -191,7 +191,7 @@ class Toml(Strict):
         AfterValidator(_address),
     ] = ""
     description: Annotated[str, line(500)] = ""
-    #: Follows from the architecture; may be stated too.
+    #: Follows from the architecture, but may be stated too.
     kind: Any = None
     policy: dict[str, Any]
     training: Training | None = None
@@ -230,7 +230,7 @@ def load(folder: Path | str) -> Submission:
     numbers = sum(array.size for _, policy in policies for array in policy.arrays.values())
     if made.counts_as == "learned" and numbers > protocol.ALL_NUMBERS:
         raise Refused(
-            f"the networks have {numbers:,} numbers together, at most {protocol.ALL_NUMBERS:,} are accepted"
+            f"the networks have {numbers:,} numbers together; at most {protocol.ALL_NUMBERS:,} are accepted"
         )
     if told.kind == "learned":
         _check_different(policies)
@@ -258,7 +258,7 @@ def about(files: Mapping[str, bytes]) -> About:
     training = _training(told.training, found) if told.training else {}
     kind = _kind(made, bool(training), told.kind)
     if not made.arrays and found:
-        raise Refused(f"policy_{found[0]}.safetensors: such a policy has no arrays; remove it")
+        raise Refused(f"policy_{found[0]}.safetensors: such a policy has no arrays; remove the file")
     least = protocol.LEARNED_POLICIES if kind == "learned" else 1
     if made.arrays and len(found) < least:
         raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
@@ -303,11 +303,11 @@ def read_files(folder: Path) -> dict[str, bytes]:
             raise Refused(f"{name} is not a plain file; links, folders and devices are refused")
         most = protocol.TOML_BYTES if name == TOML else protocol.POLICY_BYTES
         if about.st_size > most:
-            raise Refused(f"{name} has {about.st_size} bytes, at most {most} are accepted")
+            raise Refused(f"{name} has {about.st_size} bytes; at most {most} are accepted")
         sizes[name] = about.st_size
     if sum(sizes.values()) > protocol.FOLDER_BYTES:
         raise Refused(
-            f"the files have {sum(sizes.values())} bytes, at most {protocol.FOLDER_BYTES} are accepted"
+            f"the files have {sum(sizes.values())} bytes; at most {protocol.FOLDER_BYTES} are accepted"
         )
     return {name: _read(folder / name, size) for name, size in sizes.items()}
 
@@ -429,7 +429,7 @@ def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Archit
     if set(shapes) != set(made.arrays):
         odd = sorted(set(shapes) ^ set(made.arrays))[0]
         what = "is missing" if odd in made.arrays else "is not known"
-        raise Refused(f"{name}: array {shown_ascii(odd)} {what}; needed are {', '.join(made.arrays)}")
+        raise Refused(f"{name}: array {shown_ascii(odd)} {what}; the arrays must be {', '.join(made.arrays)}")
     lengths: dict[str, int] = {}
     for key, needed in made.arrays.items():
         shape = shapes[key]
@@ -504,7 +504,7 @@ def write(
             raise Refused(f"{what} must be a text, got {shown_ascii(text)}")
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} already exists")
-    # The oldest version that has such policies, so that a policy's files never change.
+    # State the oldest version that has such policies, so that a policy's files never change.
     schema = architecture(env, policy).schema if env in protocol.boards() else 1
     told: dict[str, Any] = {
         "schema": schema, "env": env, "name": name, "authors": list(authors), "license": license,
@@ -532,7 +532,7 @@ def write(
 
 
 def _check_kinds(env: Any, authors: Any, policy: Any, arrays: Any, training: Any) -> None:
-    """Refuse what is of another kind than `write` documents; a string would pass for a list of letters."""
+    """Refuse arguments of kinds that `write` does not document: a string would pass for a list of letters."""
     names = [authors] if isinstance(authors, str) else ["A. Author"]
     for what, given, kind, wanted in (
         ("env", env, str, "an environment's id, such as 'PivotedBar-v0'"),

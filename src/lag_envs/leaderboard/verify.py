@@ -44,7 +44,7 @@ def verify(
     episodes: int = protocol.EPISODES,
     progress: Callable[[int, int], Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the results of a submission's policies, all of it recomputed.
+    """Return the results of a submission's policies, all of them recomputed.
 
     Parameters
     ----------
@@ -71,13 +71,13 @@ def verify(
     Raises
     ------
     Refused
-        If a policy fails, or returns something that is no action.
+        If a policy fails, or returns something that is not an action.
     """
     if not 1 <= episodes <= 100_000:
         raise ValueError(f"episodes must lie between 1 and 100000, got {episodes}")
     started, busy = time.perf_counter(), time.process_time()
     env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
-    # Acting often draws other kicks, and averaging them out takes as many episodes again.
+    # Acting often draws other kicks, and averaging these out takes all episodes.
     runs = [(condition, few) for condition in on_board(env)]
     runs.append((often(env), episodes if TASKS[env]().draws else few))
     nominal, *sizes = (condition.steps(env) * count for condition, count in [(Condition(), episodes), *runs])
@@ -239,7 +239,9 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", metavar="N", type=int, default=1, help="submissions to verify in parallel (default: 1)"
     )
-    parser.add_argument("--ray", metavar="ADDRESS", help='spread them over a Ray cluster; "local" starts one')
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help='spread the submissions over a Ray cluster; "local" starts one'
+    )
     parser.add_argument("--json", type=new_file, metavar="FILE", help="write all results to this file")
     parser.add_argument(
         "--against", metavar="FILE",
@@ -296,7 +298,7 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _comparable(folders: list[Path], before: dict[str, dict[str, Any]], args: argparse.Namespace) -> bool:
-    """Return whether there are earlier results of all submissions; print which have none.
+    """Return whether there are earlier results of all submissions; print the names of those without.
 
     Raises
     ------
@@ -308,11 +310,11 @@ def _comparable(folders: list[Path], before: dict[str, dict[str, Any]], args: ar
         try:
             told = about(read_files(folder))
         except Refused:
-            continue  # verifying it tells why
+            continue  # the verification reports why
         name, other = ascii_text(folder), before.get(told.digest)
         if other is None:
             missing += 1
-            print(f"{name}: {args.against} has nothing about it (digest {told.digest})", file=sys.stderr)
+            print(f"{name}: {args.against} has no result of it (digest {told.digest})", file=sys.stderr)
             continue
         for option in ("nonce", "episodes"):
             here, there = getattr(args, option), other[option]
@@ -333,7 +335,7 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
     from lag_envs.scores import known_returns
 
     if other is None:
-        print(f"  {file} has nothing about it")
+        print(f"  {file} has no result of it")
         return True
     known = known_returns(result["env"])
     assert known is not None
@@ -346,7 +348,7 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
     else:
         print(f"  mean scores differ by {found.difference:.1e} at most from {file}")
     for what in found.far:
-        print(f"  too far from it: {what}")
+        print(f"  differs too much in {what}")
     return bool(found.far)
 
 
