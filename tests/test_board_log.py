@@ -124,7 +124,7 @@ def rewritten(board, change):
         (lambda told: told.pop(2), "line 3: .* nonce 'n', which is not its own"),
         (lambda told: told.insert(1, told.pop(2)), "line 3: .* is earlier than the line before it"),
         (lambda told: told.append(told[3]), "line 5: .* is verified, but was verified already"),
-        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* already on the board, verified"),
+        (lambda told: told.append(told[1] | {"at": told[3]["at"]}), "line 5: .* is already on the board"),
         (lambda told: told.append(told[2] | {"at": told[3]["at"]}), "line 5: the nonce 'n' was published"),
         (lambda told: told[3].update(nonce="other"), "line 4: .* which is not its own"),
         (lambda told: told[3].update(supersedes=[told[1]["id"]]), "line 4: .* not another result"),

@@ -48,7 +48,7 @@ KINDS = {"learned": "Learned", "controller": "Controller", "optimal": "Optimal"}
 
 
 class Column(NamedTuple):
-    """A column of a ranking: its key in a row, heading, meaning, and whether small is good."""
+    """A column of a ranking: its key in a row, heading, meaning, and whether small values are good."""
 
     key: str
     label: str
@@ -60,7 +60,7 @@ COLUMNS = (
     Column(
         "rank",
         "Rank",
-        "Of agents that share a rank, none is clearly better than another. An agent that acts like an "
+        "Of the agents that share a rank, none is clearly better than another. An agent that acts like an "
         "earlier one has no rank.",
         True,
     ),
@@ -74,8 +74,8 @@ COLUMNS = (
     Column(
         "return",
         "Return",
-        "Mean return of an episode, over all training seeds. One that failed lowers it, but hardly the "
-        "score, which leaves out the best and the worst.",
+        "Mean return of an episode, over all training seeds. A seed that failed lowers it, but hardly "
+        "affects the score, which leaves out the best and the worst seeds.",
     ),
     Column(
         "gap",
@@ -91,8 +91,8 @@ COLUMNS = (
     Column(
         "settle",
         "Settle",
-        "Median time until the goal is reached for good, unless said otherwise; over all episodes, missing "
-        "if half of them never reach it.",
+        "Median time, over all episodes, until the goal is reached for good, unless stated otherwise. It is "
+        "missing if half of the episodes never reach the goal.",
         True,
     ),
     Column("effort", "Effort", "Mean square of the control, as a share of its limit.", True),
@@ -111,9 +111,9 @@ COLUMNS = (
 def write_page(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     """Write the page.
 
-    A browser that reads the old page meanwhile, or a kill at any moment, finds whole pages: scripts, styles
-    and data have the hash of their content in their names, each page is replaced at once, the overview last,
-    and files that no page refers to are removed at the end.
+    Pages stay whole for a browser that reads the old page meanwhile, and after a kill at any moment: scripts,
+    styles and data have the hash of their content in their names, each page is replaced at once, the overview
+    last, and files that no page refers to are removed at the end.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def write_page(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     ValueError
         If the address is not http or https.
     BoardError
-        If the folder holds files, and none of them says that an earlier build wrote them.
+        If the folder holds files that no earlier build wrote.
     NotADirectoryError, OSError
         If the folder cannot be written.
     """
@@ -298,7 +298,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     board["optimum"] = None
     if known.get("optimum") is not None and known["best"] != known["random"]:
         board["optimum"] = (known["optimum"] - known["random"]) / (known["best"] - known["random"])
-    # From the best agent that can be watched; without any, the scene at its start.
+    # Taken from the best agent that can be watched; without one, the scene is shown at its start.
     watched = [row for row in board["rows"] if row["replays"]]
     shown = next((row for row in watched if row["rank"] is not None), watched[0] if watched else None)
     board["shown"] = shown and shown["name"]
@@ -366,7 +366,7 @@ def safe_url(url: Any) -> str | None:
 
 
 def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequence[float]]:
-    """Return states of an episode at equal times, while most of the motion happens."""
+    """Return states of an episode at evenly spaced times, while most of the motion happens."""
     if not names or len(states[0]) != len(names):
         return []
     values = np.nan_to_num(np.array(states, np.float64))

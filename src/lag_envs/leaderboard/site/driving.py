@@ -34,7 +34,7 @@ MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 def script(env_id: str) -> str | None:
     """Return the file with which a page drives an environment of the package.
 
-    None for an unknown id, and for one with imperfections that scripts do not have.
+    None for an unknown id, and for an environment with imperfections that scripts do not have.
     """
     kind: Any = TASKS.get(env_id)
     try:
@@ -137,7 +137,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
         for name, value in values.items()
         if 0.0 < value < math.inf and (others := _made(kind, {name: value}, MARKS))
     }
-    # All at once, which is quick; one by one only if that fails.
+    # Try all at once, which is quick; try them one by one only if that fails.
     together = _follows(env, {name: values[name] for name in marked})
     found: list[dict[str, Any]] = []
     for name, others in marked.items():
@@ -225,7 +225,7 @@ def agent(policy: SubmittedPolicy) -> dict[str, Any] | None:
     """
     made = policy.architecture
     if isinstance(made, GridArchitecture) and made.task.imperfections:
-        return None  # it looks ahead on the environment without imperfections, which the page does not have
+        return None  # such a policy looks ahead on the undisturbed environment, which the page does not have
     if isinstance(made, Network | Linear | GridArchitecture):
         about, arrays, head = _learned(policy), policy.arrays, made.head
     elif isinstance(made, PlanArchitecture | ControllerPolicy) and not made.plans:

@@ -8,10 +8,10 @@ const PAIRS = [["ArrowLeft", "ArrowRight"], ["ArrowDown", "ArrowUp"], ["a", "d"]
 const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowDown: "↓", ArrowUp: "↑" };
 const SPOKEN = { ArrowLeft: "left arrow", ArrowRight: "right arrow", ArrowDown: "down arrow", ArrowUp: "up arrow" };
 const nameOf = (key) => NAMES[key] ?? key.toUpperCase();
-/** Keys that act as others while these drive nothing themselves. */
+/** Keys that act as arrow keys while they control nothing themselves. */
 const ALIASES = { a: "ArrowLeft", d: "ArrowRight", s: "ArrowDown", w: "ArrowUp" };
 
-/** Where an event's key is on the keyboard; those on a screen have no place. */
+/** Where an event's key is on the keyboard; keys on a screen have no place. */
 const placeOf = ({ code, key }) => code || key.toLowerCase();
 
 /** Keys, pointer and gamepad as numbers per control. */
@@ -41,7 +41,7 @@ class Hands {
     this.pressed.set(place, { key: this.keyOf(event), held: true, read: false });
   }
 
-  /** While one drives, a key that is let go before a step has read it still acts on the next one. */
+  /** While somebody drives, a key that is released before a step has read it still acts on the next step. */
   lift(event, driving) {
     const pressed = this.pressed.get(placeOf(event));
     if (!pressed) return;
@@ -140,7 +140,7 @@ const LACKING = [
 ];
 const lacking = () => LACKING.filter(([, there]) => !there).map(([what]) => what);
 
-/** A value with its numbers changed by those of others of the same shape: a + Σ (b - a). */
+/** A value whose numbers are changed by those of other values of the same shape: a + Σ (b - a). */
 function changed(base, others) {
   if (typeof base === "number") return others.reduce((sum, other) => sum + other - base, base);
   if (!Array.isArray(base)) return base;
@@ -148,7 +148,7 @@ function changed(base, others) {
   return base.map((part, i) => changed(part, others.map((other) => other[i])));
 }
 
-/** Numbers of the same shape on the way from one to the other. */
+/** Numbers between two values of the same shape. */
 function scaled(a, b, share) {
   if (typeof a === "number") return a + (b - a) * share;
   if (!Array.isArray(a)) return a;
@@ -216,12 +216,12 @@ function open(root, board, code, tools) {
     (unit) => ` in ${unit}`,
   );
   const touched = matchMedia("(hover: none)").matches;
-  // Without a key the first of listed actions acts, which may push too.
+  // Without a key, the first listed action is taken, which may push too.
   const unasked = about.controls
     .map((control, i) => [control, control.values[about.rest[i]]])
     .map(([control, x]) => (x ? ` Without a ${touched ? "touch" : "key"}, ${symbol(control.name)} is ${valueOf(control, x)}.` : ""))
     .join("");
-  /** Whether time waits for the first input: what acts without one would end some episodes at once. */
+  /** Whether time waits for the first input: the action without any input would end some episodes at once. */
   const waiting = () => Boolean(unasked && !rerunning && !me.steps && hands.idle);
   const nothing = board.picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
   /** What a finger on the picture does. */
@@ -238,7 +238,7 @@ function open(root, board, code, tools) {
       : `${keys}; or hold the mouse button on the picture, or use a gamepad. Space or a click starts.`;
     return `${keys ? by : "There is nothing to control here: just watch. Space or a tap starts."}${unasked}${nothing}`;
   };
-  stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "Nothing acts here"}. Space starts and pauses, R restarts, N is another start.`);
+  stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "There is nothing to control"}. Space starts and pauses, R restarts, N draws another start.`);
 
   let { constants } = code;
   const anySeed = () => big(Math.floor(Math.random() * 2 ** 32));
@@ -258,7 +258,7 @@ function open(root, board, code, tools) {
   const finished = (episode) => episode.over === "terminated" || episode.over === "truncated";
   const ended = () => Boolean(me.over || (rerunning && !rerunning.keys[me.steps]));
 
-  /** A return, and its score if the episode is whole: where rewards are costs, a part of it looks too good. */
+  /** A return, and its score if the episode is whole: where rewards are costs, a part of an episode looks too good. */
   const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode.total))}` : ""}`;
 
   const tell = (words, spoken = words) => {
@@ -297,7 +297,7 @@ function open(root, board, code, tools) {
     return `${name}${start === undefined ? "" : `, seed ${start}`}, return ${text(total, 2)}`;
   }
 
-  /** Whether the chosen ghost is still to come; until then nothing starts, because a ghost begins the drive anew. */
+  /** Whether the chosen ghost is still loading; until it is there, nothing starts, because a ghost restarts the drive. */
   const loading = () => Boolean(ghostSelect.value && !ghost);
 
   async function chooseGhost() {
@@ -335,7 +335,7 @@ function open(root, board, code, tools) {
     const start = ghost.replay.reset_seed;
     if (start !== undefined) seed = big(start);
     beginAnew();
-    if (start === undefined) tell("The seed of this episode is not known: the ghost starts elsewhere.", starting(heard));
+    if (start === undefined) tell("The seed of this episode is not known, so the ghost starts elsewhere.", starting(heard));
   }
 
   function startGhost() {
@@ -405,8 +405,8 @@ function open(root, board, code, tools) {
   }
 
   /**
-   * Play on a trial episode in the browser's idle time. A browser runs new code slowly at first, up to a hundred
-   * times, and compiles what it has often run; so a drive begins at full speed.
+   * Play a trial episode in the browser's idle time. A browser runs new code slowly at first, up to a hundred times
+   * slower, and compiles what it has run often. So a drive begins at full speed.
    */
   function warmUp() {
     const [trial, act, room] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest), roomOf(about)];
@@ -438,7 +438,7 @@ function open(root, board, code, tools) {
     if (me.over) close();
   }
 
-  /** Stop. What is said and offered at the end waits for the next frames: it lays out the page anew. */
+  /** Stop. The final texts and the link wait for the next frames, because they lay out the page anew. */
   function close(words = "") {
     const of = me;
     const later = (work) => () => {
@@ -456,8 +456,8 @@ function open(root, board, code, tools) {
     const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
     const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
     const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
-    const next = touched ? "Start again: this start. New start: another."
-      : `R: ${rerunning ? "drive from this start" : "again"}, N: another start.`;
+    const next = touched ? "Start again repeats this start; New start draws another."
+      : `Press R to ${rerunning ? "drive from this start" : "try again"}, N for another start.`;
     tell(`${ending}: ${result}${beside}. ${next}`);
   }
 
@@ -482,7 +482,7 @@ function open(root, board, code, tools) {
     if (!me.steps && !rerunning) message.textContent = "";
     left += Math.min(Math.max(time - before, 0), 100) / 1000 * Number(speed.value);
     before = time;
-    // Where the steps of a frame take too long, time runs slower instead of in jerks.
+    // If the steps of a frame take too long, time runs slower instead of in jerks.
     const end = performance.now() + 3;
     while (running && left >= about.dt) {
       left -= about.dt;
@@ -514,7 +514,7 @@ function open(root, board, code, tools) {
     requestAnimationFrame(frame);
   }
 
-  /** Pause or go on. What has ended starts again, with the player at the controls. */
+  /** Pause or go on. An episode that has ended starts again, with the player at the controls. */
   function toggle() {
     if (running) {
       pause();
@@ -536,7 +536,7 @@ function open(root, board, code, tools) {
     show(1);
   }
 
-  // --- what is to be seen
+  // --- display
 
   function show(part) {
     const { pen, width, height } = cleared(canvas);
@@ -630,7 +630,7 @@ function open(root, board, code, tools) {
 
   // --- links
 
-  /** Recompute a link's drive, a little in each frame, and tell whether its claim is true. */
+  /** Recompute a link's drive, a little in each frame, and report whether its claim is true. */
   function checkLink(address) {
     if (rerunning) beginAnew();
     else if (running) pause();
@@ -721,7 +721,7 @@ function open(root, board, code, tools) {
       if (!running && !ended() && !event.repeat) run();
     } else if (key in acts) {
       if (!event.repeat) acts[key]();
-    } else if (!running || !key.startsWith("Arrow")) return; // while one drives, arrows do not scroll the page
+    } else if (!running || !key.startsWith("Arrow")) return; // while somebody drives, arrows do not scroll the page
     event.preventDefault();
   });
   stage.addEventListener("keyup", (event) => hands.lift(event, running && !rerunning));
@@ -746,7 +746,7 @@ function open(root, board, code, tools) {
     hands.pointer = [clamp(across, -1, 1), clamp(up, -1, 1)];
   }
 
-  // A finger at rest on the picture scrolls the page, unless it taps; while one drives, it steers.
+  // A finger at rest on the picture scrolls the page, unless it taps; while somebody drives, it steers.
   canvas.addEventListener("pointerdown", (event) => {
     if (event.button || hands.finger !== null) return;
     if (!running && event.pointerType === "touch") {

@@ -33,7 +33,7 @@ function multiply(aHigh, aLow, bHigh, bLow) {
   high = (a1 * b1 + (second >>> 16) + (third >>> 16) + Math.imul(aHigh, bLow) + Math.imul(aLow, bHigh)) >>> 0;
 }
 
-/** The word, with its upper bits also further down. */
+/** The word, with its upper bits mixed into the lower ones. */
 function fold(by) {
   low = (low ^ ((low >>> by) | (high << (32 - by)))) >>> 0;
   high = (high ^ (high >>> by)) >>> 0;
@@ -161,7 +161,7 @@ class Episode {
   }
 }
 
-/** The action for a step's numbers. */
+/** The action for the numbers of a step. */
 const actionOf = (key, { controls, levels, largest }) => key.map((n, i) => (controls[i].values.length ? n : largest * (n / levels)));
 
 // --- links -----------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ function readLink(link, about) {
   }
   if (!Number.isFinite(doubleOf(claimed))) throw new Error("The link is forged: the return that it claims is not a finite number.");
   if (digest !== about.digest) throw new Error("The drive was made with another version of this environment.");
-  if (!packed) throw new Error("The link's drive has no step.");
+  if (!packed) throw new Error("The link's drive has no steps.");
   return { seed: big(seed), keys: unpack(packed, about), claimed };
 }
 
@@ -295,7 +295,7 @@ function agentOf(about) {
   };
 }
 
-/** Numbers as an action: clipped in a range; in a list, the largest number chooses. The array is used again. */
+/** Numbers as an action: clipped in a range; in a list, the largest number chooses. The array is reused. */
 function actionsFrom(numbers, { choices, largest }, action) {
   if (!choices.length) {
     for (let i = 0; i < action.length; i++) action[i] = Math.fround(clamp(numbers[i], -largest, largest));
@@ -329,7 +329,7 @@ function reader({ zero, inverse, states, width, pairs }) {
   };
 }
 
-/** A layer without its activation, into an array of its own: column by column, as many inputs may be 0. */
+/** A layer without its activation, in a separate array: column by column, because many inputs may be 0. */
 function affine(weight, bias) {
   const [rows, wide] = weight.shape;
   const columns = new Float64Array(rows * wide);
@@ -431,13 +431,13 @@ function feedback(about, { gain, offset }) {
   };
 }
 
-/** x rounded to a whole number, halves to the even one. */
+/** x rounded to a whole number, halves to the even number. */
 function rounded(x) {
   const found = Math.round(x);
   return found - x === 0.5 && found % 2 ? found - 1 : found;
 }
 
-/** Planned actions minus gains times the state's distance from the plan; after the end, the last ones. */
+/** Planned actions minus gains times the state's distance from the plan; after the plan's end, those of its last step. */
 function plan(about, { states, actions, gains }) {
   const read = reader(about.read);
   const wrapped = about.read.pairs.map(([i]) => i);

@@ -1,5 +1,5 @@
 "use strict";
-/* The leaderboard's page. Plain JavaScript, no build step, nothing from elsewhere, works from file: too.
+/* The leaderboard's page. Plain JavaScript without a build step or other hosts; it works from file: too.
  *
  * Submissions are untrusted: their contents become text (textContent) or numbers, never markup.
  *
@@ -56,7 +56,7 @@
     return String(+x.toPrecision(3));
   }
 
-  /** Multiples of a round step between two numbers, about so many. */
+  /** About `wanted` multiples of a round step between two numbers. */
   function ticks(low, high, wanted = 4) {
     const rough = (high - low) / wanted;
     if (!(rough > 0) || !Number.isFinite(rough)) return { step: 1, at: [low] };
@@ -156,7 +156,7 @@
     });
   }
 
-  /** A picture with only what is not in the same place in another moment: bodies, marks, moved parts of the frame. */
+  /** The parts of a picture that are elsewhere at another moment: bodies, marks, moved parts of the frame. */
   function apart(picture, poses, others) {
     const moved = (i) => [0, 1, 2].some((j) => poses[i][j] !== others[i][j]);
     const shapes = picture.shapes.filter((shape) => {
@@ -331,7 +331,7 @@
     const frame = (now) => {
       if (!running || !seen) return;
       begun ||= now;
-      // It rests while somebody drives, whose frames it would slow down.
+      // The film pauses while somebody drives, because it would slow down the drive.
       if (find(".stage[data-driving]")) {
         requestAnimationFrame(frame);
         return;
@@ -390,7 +390,7 @@
           fetched.delete(file);
           reject(new Error(`${what} could not be loaded. Check the connection and try again.`));
         });
-        // The script has put its data by now, unless it could not be run.
+        // By now, the script has delivered its data, unless it could not be run.
         script.addEventListener("load", () => reject(new Error(TOO_OLD)));
         document.head.append(script);
       });
@@ -590,7 +590,7 @@
           said.textContent = String(error.message);
           return;
         }
-        // Another choice has been made meanwhile.
+        // Another agent has been chosen meanwhile.
         if (asked !== side.asked) return;
         [side.row, side.replay] = [row, replays[episode] ?? replays[0]];
         side.episode.replaceChildren(...replays.map((replay, i) => {
@@ -661,7 +661,7 @@
 
     const ready = board.rows.map((row, i) => (row.file ? i : -1)).filter((i) => i >= 0);
     const other = ready.find((i) => board.rows[i].kind !== board.rows[ready[0]].kind) ?? ready[1];
-    // Episodes are large files: load them once this comes into view, unless some were chosen before.
+    // Episodes are large files: load them once the player comes into view, unless some were chosen before.
     new IntersectionObserver((entries, observer) => {
       if (!entries.some((entry) => entry.isIntersecting)) return;
       observer.disconnect();
@@ -675,7 +675,7 @@
 
   const lanes = (width) => ({ left: width < 500 ? 8 : 64, right: 8 });
 
-  /** What is drawn over time: a name, and the values of an episode; each number of an action on its own. */
+  /** The curves over time: a name, and the values in an episode; each number of an action has its own curve. */
   function tracesOf(sides) {
     const many = Math.max(1, ...sides.map(({ replay }) => (replay ? [replay.actions[0]].flat().length : 1)));
     const actions = Array.from({ length: many }, (_, k) => ({
@@ -918,7 +918,7 @@
 
   // --- ranking ---------------------------------------------------------------------------------------------
 
-  /** The mark of a kind, told apart not by colour alone: a dot, a square, a diamond. */
+  /** The mark of a kind, which colour alone does not distinguish: a dot, a square, a diamond. */
   function mark(kind, size = 4.5) {
     if (kind === "controller") {
       return draw("rect", { x: -size, y: -size, width: 2 * size, height: 2 * size, class: "dot" });
@@ -1059,7 +1059,7 @@
     form.addEventListener("input", filter);
     for (const input of all("[name=axis]", form)) input.addEventListener("change", pictures);
     pictures();
-    // Going back to the page, browsers fill in the earlier choices.
+    // When readers go back to the page, browsers fill in the earlier choices.
     filter();
   }
 
@@ -1119,7 +1119,7 @@
         scores.reduce((most, score) => Math.max(most, Math.min(score, 1.2)), 1),
       ],
       format: count,
-      tell: (line) => `${text(line[line.length - 1][1], 2)} in the end`,
+      tell: (line) => `${text(line[line.length - 1][1], 2)} at the end`,
       empty: "No submission here states a learning curve.",
     });
   }
@@ -1175,7 +1175,7 @@
       }
       return d;
     };
-    // Grey ones first, so that they lie below.
+    // Draw grey lines first, so that they lie below the others.
     const ordered = [...series].sort((a, b) => chosen.has(a.i) - chosen.has(b.i) || b.i - a.i);
     for (const { i, lines, faint = [] } of ordered) {
       const look = chosen.has(i) ? "chosen" : "other";
@@ -1211,7 +1211,7 @@
 
   // --- drive -----------------------------------------------------------------------------------------------
 
-  /** The address from # on; some programs that pass links on write ~ and = as %7E and %3D. */
+  /** The address from # on; some programs that pass on links write ~ and = as %7E and %3D. */
   function hash() {
     try {
       return decodeURIComponent(location.hash);
@@ -1244,7 +1244,7 @@
         if (wanted) find(".stage", root).focus({ preventScroll: true });
         find(wanted ? ".driver" : "h2", root).scrollIntoView();
       } catch (error) {
-        // Mistakes of the program come from what an old browser lacks.
+        // Errors of the program come from features that an old browser lacks.
         said.textContent = error.constructor === Error ? error.message : TOO_OLD;
         find(".driver", root).replaceChildren(begin);
         begin.disabled = false;
