@@ -72,7 +72,7 @@ def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
         metavar="YYYY-MM-DD",
         type=_date,
         default=date.today().isoformat(),
-        help=f"date to note {where} (default: today)",
+        help=f"date to write {where} (default: today)",
     )
 
 

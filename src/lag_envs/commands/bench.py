@@ -32,7 +32,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN_OR_MODULE}",
     )
     parser.add_argument(
-        "--quick", action="store_true", help="fewer and shorter samples, no cold start: under a minute"
+        "--quick", action="store_true", help="fewer and shorter samples, no cold start; takes under a minute"
     )
     parser.add_argument(
         "--cold", action="store_true", help="only the cold start: import, make, reset, first step"
@@ -237,8 +237,8 @@ the cold start of whole processes. Ctrl-C ends the measurement and keeps the res
 Ctrl-C ends it at once, without results.
 
 examples:
-  lag-envs bench --quick                             one environment, under a minute
-  lag-envs bench --output speed.json                 everything, a few minutes
+  lag-envs bench --quick                             one environment, in under a minute
+  lag-envs bench --output speed.json                 everything, in a few minutes
   lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file

@@ -108,7 +108,7 @@ INFO = Command(
 examples:
   lag-envs info PivotedBar-v0
   lag-envs info ball_on_beam.py              a task of your own; this runs the file
-  lag-envs info mine.py:Balance              one of several""",
+  lag-envs info mine.py:Balance              one of several tasks""",
     declare_info,
     run_info,
 )

@@ -45,7 +45,7 @@ episodes, and report which order to write into the task. Every order meets the s
 
 examples:
   lag-envs order ball_on_beam.py             a task of your own; this runs the file
-  lag-envs order mine.py:Balance             one of several""",
+  lag-envs order mine.py:Balance             one of several tasks""",
     declare_order,
     run_order,
 )

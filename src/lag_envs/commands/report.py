@@ -24,7 +24,9 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
         "(default: report, or report-NAME)",
     )  # fmt: skip
     parser.add_argument(
-        "--quick", action="store_true", help="fewer cases and methods, the pivoted bar first: under a minute"
+        "--quick",
+        action="store_true",
+        help="fewer cases and methods, the pivoted bar first; takes under a minute",
     )
     parser.add_argument(
         "--sections",
@@ -108,8 +110,8 @@ Writes a folder with index.html, figures, tables as CSV and everything as JSON. 
 run it again to resume after Ctrl-C. heyoka, diffrax, torchdiffeq and MuJoCo take part if they are installed.
 
 examples:
-  lag-envs report --quick                            a first look, under a minute
-  lag-envs report                                    everything, about half an hour on two cores
+  lag-envs report --quick                            a first look, in under a minute
+  lag-envs report                                    everything, in about half an hour on two cores
   lag-envs report --docs .                           the same, and update this checkout's docs
   lag-envs report --sections bound,stability maps    two parts, into the folder maps
   lag-envs report ball_on_beam.py                    scenes of your own, into report-ball_on_beam;

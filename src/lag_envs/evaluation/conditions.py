@@ -99,10 +99,10 @@ def _positive(env_id: str) -> dict[str, float]:
 def imperfections(env_id: str) -> list[Condition]:
     """Return conditions of imperfect sensors and actuators, and of hidden parameters.
 
-    They are observation noise of 0.01 (tasks scale entries to about 1); actions that are one control interval
-    late; actuators with a lag of two intervals; occasional pushes of 2 % of the largest rate; and the first
-    `MOST_DRAWN` of the environment's numbers, drawn within 20 % in each episode. Imperfections that the
-    environment already has stay as they are.
+    They are observation noise of 0.01 (tasks scale entries to about 1), actions that are one control
+    interval late, actuators with a lag of two intervals, occasional pushes of 2 % of the largest rate, and
+    the first `MOST_DRAWN` of the environment's numbers, drawn within 20 % in each episode. Imperfections
+    that the environment already has stay as they are.
     """
     kind: Any = TASKS[env_id]
     task = kind()

@@ -528,7 +528,7 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
             try:
                 again, episodes = record_again(submission, dict(result), number, chosen)
             except (PolicyError, Refused) as error:
-                odd.append(f"a policy that {error}")
+                odd.append(f"a policy that cannot be played: {error}")
                 continue
             played += len(chosen)
             kept = {

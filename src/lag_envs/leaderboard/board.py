@@ -289,7 +289,7 @@ class Board:
         Raises
         ------
         BoardError
-            If the nonce is empty, not plain text, or was published before, so that it is known.
+            If the nonce is empty, not plain text, or was published before, and so is already known.
         """
         if not re.fullmatch(r"[!-~]{1,200}", nonce):
             raise BoardError(

@@ -49,7 +49,7 @@ def generated(project: Path) -> dict[Path, str]:
 
 
 def together(data: dict[str, Any]) -> str:
-    """Return a table of the best agents over all boards, with the best learned one in any case."""
+    """Return a table of the best agents over all boards, which always has the best learned one."""
     every = list(enumerate(data["combined"], 1))
     shown = every[:BEST] + [one for one in every[BEST:] if one[1]["kind"] == "learned"][:1]
     if not shown:

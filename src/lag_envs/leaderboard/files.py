@@ -1,4 +1,4 @@
-"""Digests of files, and reading untrusted ones: only plain ones, and only up to a size."""
+"""Digests of files, and reading of untrusted files: only plain files, and only up to a given size."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class GridTable(PolicyTable):
 
 
 class GridArchitecture(Architecture):
-    """Numbers at the nodes of a grid, interpolated linearly along every axis; beyond it, its edge counts.
+    """Numbers at the nodes of a grid, interpolated linearly along every axis; edge values hold outside.
 
     In the table: `axes`, the list of the axes, each of which is a state by its name (`lag-envs info ID`),
     ``target``, a state relative to the target as ``"x - target"``, or ``time`` [s] since the episode's start.

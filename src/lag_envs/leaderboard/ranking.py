@@ -86,7 +86,7 @@ class Place(NamedTuple):
     id : str
         The row.
     rank : int
-        From 1; rows share one if none of them is clearly better. The next rank counts them all.
+        From 1; rows share a rank if none of them is clearly better. The next rank counts all of them.
     above : Chance or None
         Probability that the row above does better than this one; None for the first.
     """
@@ -108,7 +108,7 @@ def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]
     Parameters
     ----------
     reference : Reference or None
-        The environment's reference; None for one that has none.
+        The environment's reference; None if it has none.
     policies : sequence of mapping
         The verified data of each policy: ``returns`` and, if the environment has one, ``reference``.
     """

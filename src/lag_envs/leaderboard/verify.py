@@ -303,7 +303,7 @@ def _comparable(folders: list[Path], before: dict[str, dict[str, Any]], args: ar
     Raises
     ------
     UserError
-        If one is of other episodes, or was measured under other conditions.
+        If an earlier result is of other episodes, or was measured under other conditions.
     """
     missing = 0
     for folder in folders:
