@@ -72,7 +72,7 @@ class PlayedPolicy:
     quick: bool
 
     def asked(self, other: PlayedPolicy) -> float:
-        """Return the mean square difference of another policy's actions on this path; if it fails, `FAR`'s."""
+        """Return the mean square difference of another policy's actions on this path; `FAR`'s if it fails."""
         agent, seen, did = other.policy.agent(), self.played.observations, self.played.actions
         start = np.ones(len(self.returns), np.bool_)
         try:

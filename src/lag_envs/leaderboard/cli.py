@@ -125,7 +125,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     )
     one = action("pin", "write the log's head into a file that ships with a release", _pin)
     one.add_argument(
-        "file", metavar="FILE", nargs="?", type=Path, help="file to write (default: the package's)"
+        "file", metavar="FILE", nargs="?", type=Path, help="file to write (default: the pin of this package)"
     )
     one = action(
         "open",

@@ -47,7 +47,7 @@ def bin_centres(bins: int) -> Array:
 
 
 def stacked(observation: NDArray, frames: int, before: NDArray | None = None, start: Any = None) -> NDArray:
-    """Return an episode's last observations side by side, the oldest first; earlier ones are zeros.
+    """Return an episode's last observations side by side, oldest first; zeros stand for any before its start.
 
     Parameters
     ----------
