@@ -164,7 +164,7 @@ def test_additions_of_two_clones_conflict(board, tmp_path):
     for how in ([], ["--union"]):  # a union would keep both, and break the chain
         merge = ["git", "merge-file", *how, "-p", str(a), str(base), str(b)]
         merged = subprocess.run(merge, capture_output=True).stdout
-        with pytest.raises(BoardError, match=r"line \d+ is not (an event|what followed)"):
+        with pytest.raises(BoardError, match=r"line \d+ (is not an event|does not follow)"):
             parse(merged)
     shutil.copy(b, a)
     first = Board(first / "board")

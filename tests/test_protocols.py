@@ -117,7 +117,7 @@ def test_a_later_record_does_not_move_the_scale_of_a_board(board, monkeypatch):
 def test_other_rules_need_another_protocol(board, monkeypatch):
     add(board, nonce="1")
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 7)
-    with pytest.raises(BoardError, match="add to a board of protocol 1: learned_policies differ"):
+    with pytest.raises(BoardError, match="add to a board of protocol 1, whose learned_policies differ"):
         add(board, "TQC")
     assert len(board_data(board)["environments"][0]["rows"]) == 1  # existing results can be shown
     board.open()

@@ -155,7 +155,7 @@ def test_the_command_on_an_environment_of_ones_own(tmp_path, capsys):
     assert "Push-v0, seed 5, 50 steps" in capsys.readouterr().out
     other = driven(TASKS[ID]())
     assert cli.main(["replay", replay.write_link(other), "--file", str(file)]) == 2
-    assert f"the link is for {ID!r}, and {file} has 'Push-v0'" in capsys.readouterr().err
+    assert f"the link is for {ID!r}, but {file} has 'Push-v0'" in capsys.readouterr().err
 
 
 # --- the board's best drives --------------------------------------------------------------------------------
