@@ -120,7 +120,7 @@ def test_a_link_is_recomputed_in_the_page(drive, link):
     assert page.evaluate("[...document.querySelectorAll('.drive-controls select')][1].value") == "link:0"
     page.select_option(".drive-controls select >> nth=0", "1")
     page.click(".rerun")
-    until(page, "document.querySelector('.message').textContent.includes('R: drive from')")
+    until(page, "document.querySelector('.message').textContent.includes('Press R to drive from')")
     assert float(reading(page, "Return").replace("−", "-")) == pytest.approx(link.claimed, abs=6e-3)
     assert reading(page, "Score") not in ("–", "at the end")
     # With its last bit changed, it is false, and all digits say so.
@@ -176,7 +176,7 @@ def test_while_watching_the_keys_are_said_to_be_silent(drive, link):
     page.click(".rerun")
     assert message(page).startswith("Watching the link's drive: you do not steer")
     assert page.evaluate("document.activeElement.className") == "stage"
-    until(page, "document.querySelector('.message').textContent.includes('R: drive from this start')")
+    until(page, "document.querySelector('.message').textContent.includes('Press R to drive from this start')")
     assert page.text_content(".go") == "Start again"
     page.click(".go")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
