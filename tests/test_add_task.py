@@ -32,6 +32,7 @@ from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.site.build import write_page
 from lag_envs.leaderboard.standings import page_data
 from lag_envs.leaderboard.submission import load
+from lag_envs.own_files import load_module
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.scores import known_returns
 from lag_envs.tasks import find_tasks, measured
@@ -65,6 +66,7 @@ def task(file, tmp_path, monkeypatch):
     yield TASKS[ID]
     for name in ("two_link_arm", "own_two_link_arm"):
         sys.modules.pop(name, None)
+    load_module.cache_clear()
 
 
 @pytest.fixture

@@ -69,15 +69,17 @@ def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
     return lambda states, controls: steps(states, controls, dt, limit, *numbers)
 
 
-def jacobians(rounds: int, clock: Callable[[], float]) -> list[dict[str, Any]]:
+def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Measure the cost of `Scene.jacobian`, in a batch and one by one, and that of `Scene.vjp`.
 
     Parameters
     ----------
     rounds : int
-        Number of rounds; in each, all scenes are measured in turn, and the shortest time counts.
+        Number of rounds; in each, step and derivatives are measured in turn, and the shortest time counts.
     clock : callable
         Returns the time [s].
+    names : sequence of str
+        Some of `CASES`; by default all.
 
     Returns
     -------
@@ -87,7 +89,7 @@ def jacobians(rounds: int, clock: Callable[[], float]) -> list[dict[str, Any]]:
         ratio to a call of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which should be
         at most 4.
     """
-    return [_cost(name, rounds, clock) for name in CASES]
+    return [_cost(name, rounds, clock) for name in names or CASES]
 
 
 def _cost(name: str, rounds: int, clock: Callable[[], float]) -> dict[str, Any]:
