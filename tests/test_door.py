@@ -678,9 +678,9 @@ def test_unit_of_a_parameter():
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        ({"above": 3.0, "below": 2.0}, "no parameter is above 3 and below 2"),
-        ({"least": 3.0, "below": 3.0}, "no parameter is at least 3 and below 3"),
-        ({"least": 3.0, "most": 2.0}, "no parameter is at least 3 and at most 2"),
+        ({"above": 3.0, "below": 2.0}, "no value is above 3 and below 2"),
+        ({"least": 3.0, "below": 3.0}, "no value is at least 3 and below 3"),
+        ({"least": 3.0, "most": 2.0}, "no value is at least 3 and at most 2"),
         ({"usable": (2.0, 1.0)}, r"usable must be (lowest, highest), in this order, got (2.0, 1.0)"),
     ],
 )

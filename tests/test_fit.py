@@ -362,7 +362,7 @@ def test_a_model_that_does_not_follow():
     with pytest.warns(FitWarning) as seen:
         Pendulum(damping=0.05).fit([(noisy(states, 0.01, 1), torques, DT)], ["length"])
     texts = [str(w.message) for w in seen]
-    words = r"does not follow theta: it is off by \S+ rad, where short pieces of it are off by \S+ rad; some"
+    words = r"does not follow theta: it is off by \S+ rad, where short pieces of it are off by \S+ rad; a fix"
     assert any(re.search(words, text) for text in texts)
     assert any("residuals of theta are not independent" in text for text in texts)
 
@@ -447,18 +447,18 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
         ([], {}, "recordings must be a list of .states, controls, dt."),
         ([(STATES, None)], {}, r"recording 0 must be \(states, controls, dt\), got a tuple of 2$"),
         ([{"states": STATES}], {}, "got a dict$"),
-        (STATES, {}, r"at least one, got an array of shape \(20, 2\)$"),
+        (STATES, {}, r"a list of at least one \(states, controls, dt\), got an array of shape \(20, 2\)$"),
         ([(np.ma.masked_invalid(STATES), None, DT)], {}, r"got a masked array; call filled\(np.nan\)$"),
         ([([[1.0, None]] * 9, None, DT)], {}, r"a list of 9; np.array\(states, float\) makes NaN of None"),
         ([(STATES.astype(object), None, DT)], {}, "got an array of type object; np.array"),
         ([(STATES + 0j, None, DT)], {}, "NaN for what was not measured, got an array of type complex128$"),
-        ((STATES, None, DT), {}, r"a list of \(states, controls, dt\), got one; put it into a list$"),
+        ((STATES, None, DT), {}, r"\(states, controls, dt\), got a single recording; put it into a list$"),
         ([(STATES[:, :1], None, DT)], {}, r"recording 0: states must have shape \(N, 2\), .* got \(20, 1\)"),
         ([(STATES[:1], None, DT)], {}, "at least two states, got 1"),
         ([(STATES * np.nan, None, DT)], {}, "nothing was measured"),
         ([(STATES / [1, np.inf], None, DT), (STATES + np.inf, None, DT)], {}, "recording 1: .* row 0"),
         ([(STATES, None, 0.0)], {}, "dt must be above 0 s, got 0 s"),
-        ([(STATES, None, np.arange(20))], {}, "finer even grid and NaN between"),
+        ([(STATES, None, np.arange(20))], {}, "finer even grid, with NaN between"),
         ([(STATES, np.full(19, np.nan), DT)], {}, "controls must be finite, got nan in row 0"),
         ([(STATES, np.zeros(18), DT)], {}, "20 states need controls for the 19 steps .* got 18"),
         ([(STATES, np.zeros((19, 2)), DT)], {}, "controls must have shape"),

@@ -489,7 +489,7 @@ REFUSED = [
     ({"action_delay": (0.1, 0.2, 0.3)}, "the shortest and the longest"),
     ({"action_delay": None, "slew": 0.0}, "slew must be above 0"),
     ({"slew": math.nan}, "slew must be finite, got nan"),
-    ({"lag": -0.1}, "lag must be 0 or at least .*got -0.1 s; 0 is no lag"),
+    ({"lag": -0.1}, "lag must be 0 or at least .*got -0.1 s; 0 means no lag"),
     ({"lag": [0.1]}, r"lag must be a real number, got \[0.1\]"),
     ({"lag": {"torque": 0.1}}, r"lag\['torque'\]: there is no such control, only s_ddot"),
     ({"push": 1.0}, r"push must be \(pushes per second, largest size\), got 1.0"),

@@ -437,7 +437,10 @@ def test_bound_of_a_lagged_step():
     ("given", "message"),
     [
         ({"lag": -1.0}, "lag must be 0 or at least 1e-06 of the step of 0.02 s, got -1 s"),
-        ({"lag": 1e-9}, "lag must be 0 or at least 1e-06 of the step of 0.02 s, got 1e-09 s; 0 is no lag"),
+        (
+            {"lag": 1e-9},
+            "lag must be 0 or at least 1e-06 times the step of 0.02 s, got 1e-09 s; 0 means no lag",
+        ),
         ({"lag": math.nan}, "lag must be finite, got nan"),
         ({"lag": "0.1"}, "lag must be a real number, got '0.1'"),
         ({"lag": {"wrist": 0.1}}, r"lag\['wrist'\]: there is no such control, only shoulder, elbow"),

@@ -1,7 +1,7 @@
-"""Environments for PyTorch, with exact gradients through the step (extra ``torch``).
+"""Environments for PyTorch, with exact gradients through the step; they need the extra ``torch``.
 
-`Step` is a task's step as a function of tensors, `TorchVectorEnv` a vector environment whose `step` can be
-differentiated. Both go through the compiled step and its derivatives; torch records one operation per step.
+`Step` is a task's step as a function of tensors. `TorchVectorEnv` is a vector environment whose `step` can be
+differentiated. Both use the compiled step and its derivatives; torch records one operation per step.
 
 >>> import torch
 >>> envs = TorchVectorEnv("PivotedBar-v0", num_envs=2)
@@ -53,7 +53,7 @@ class StepResult(NamedTuple):
     states : Tensor, shape (..., n_state)
         The states after the step, with the type of the given states.
     observations : Tensor, shape (..., n_observations)
-        Their observations, with the type of the actions.
+        The observations of these states, with the type of the actions.
     rewards : Tensor, shape (...)
         The rewards, with the type of the actions.
     terminated : Tensor of bool, shape (...)
@@ -102,7 +102,7 @@ class Step:
             task = task(**options)
         elif options:
             raise ValueError(
-                f"options go with an id or a class; the given task has its own, got {sorted(options)}"
+                f"options go with an id or a class; the given task has options already, got {sorted(options)}"
             )
         self.task = _checked_task(task)
         self.model = Model(self.task)
@@ -117,9 +117,9 @@ class Step:
         states : Tensor, shape (..., n_state)
             States in the order of ``task.scene.state_names``, float32 or float64.
         actions : Tensor, shape (..., n_actions)
-            Actions; values outside their space are clipped, and then their gradient is 0.
+            Actions; values outside their space are clipped, and their gradient is then 0.
         targets : Tensor, shape (..., n_targets), optional
-            Targets, for a task that has them and does not fix them.
+            Targets, for a task whose targets are random.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class Step:
         if targets is None:
             fixed = self.task.fixed_target
             if n_targets and fixed is None:
-                raise ValueError("the task's target is random: targets must be given")
+                raise ValueError("the task's target is random, so targets must be given")
             given = torch.as_tensor(np.zeros(0) if fixed is None else np.asarray(fixed, np.float64))
             targets = given.reshape(n_targets).expand(*shape, n_targets)
         _check("targets", targets, (*shape, n_targets), whole=True)
@@ -151,14 +151,15 @@ class TorchVectorEnv:
     memory. If the actions, or the states that earlier actions led to, require a gradient, `step` is
     recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
     until `detach` cuts them off. No gradient flows across an episode's end. Copies and snapshots have no
-    history. If `envs` itself is stepped, reset or set, `state` follows; if that breaks its history, a
-    RuntimeError says so until `detach`. Inside `vmap`, `grad` and the like of `torch.func` use `Step`.
+    history. If `envs` itself is stepped, reset or set, `state` follows; if this breaks the history of
+    `state`, a RuntimeError says so until `detach` is called. Inside `vmap`, `grad` and the like of
+    `torch.func` use `Step`.
 
     On an NVIDIA GPU one kernel takes the whole step, states stay on the GPU, and there are no gradients. In
     float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
     the GPU, so it neither raises `StepRefused` nor rejects actions that are not finite. Instead, if a step
     cannot be taken, the environment keeps its state, its reward is 0, and the episode is truncated;
-    ``infos["refused"]`` says which. There, `state` is memory that the next step overwrites.
+    ``infos["refused"]`` says which. On a GPU, `state` is memory that the next step overwrites.
 
     Parameters
     ----------
@@ -169,10 +170,10 @@ class TorchVectorEnv:
     device : str or torch.device
         Device of the tensors: ``"cpu"``, or ``"cuda"`` for an NVIDIA GPU.
     dtype : torch.dtype
-        Type of states and rewards: float64, or on a GPU float32.
+        Type of states and rewards: float64, or float32 on a GPU.
     **options
-        Keywords of ``gym.make_vec``: `autoreset_mode`, parameters of the scene and of the task. They are the
-        same for all environments.
+        Keywords of ``gym.make_vec``: `autoreset_mode`, parameters of the scene and of the task. Their values
+        are the same for all environments.
 
     Attributes
     ----------
@@ -215,8 +216,8 @@ class TorchVectorEnv:
         _checked_task(made.task)
         if made.task.draws and kick_depends_on_state(made.task):
             raise ValueError(
-                f"the kick of {made.task.id or type(made.task).__name__} depends on the state, which "
-                "gradients would leave out; lag_envs.torch.Step takes steps without kicks"
+                f"the kick of {made.task.id or type(made.task).__name__} depends on the state, and gradients "
+                "would ignore this; lag_envs.torch.Step takes steps without kicks"
             )
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
         self._take_spaces(made)
@@ -234,12 +235,12 @@ class TorchVectorEnv:
     def state(self) -> Tensor:
         """The states, shape (num_envs, n_state), on the CPU with their history.
 
-        They cannot be assigned: ``reset(options={"state": ...})`` begins with other ones.
+        They cannot be assigned; ``reset(options={"state": ...})`` begins with other states.
 
         Raises
         ------
         ResetNeeded
-            Before the first reset; on a GPU they are 0 then.
+            Before the first reset; on a GPU the states are 0 then.
         RuntimeError
             If the environments are no longer where the history of the states leads.
         """
@@ -253,9 +254,10 @@ class TorchVectorEnv:
         if not np.array_equal(state.detach().numpy(), now):
             if state.requires_grad:
                 raise RuntimeError(
-                    "the environments are not where the history of `state` leads: a step was refused, they "
-                    "were changed through `envs`, or `state` in place; call detach() to continue from where "
-                    "they are, and use reset and set_state of this object"
+                    "the environments are not where the history of `state` leads: a step was refused, the "
+                    "environments were changed through `envs`, or `state` was changed in place; call "
+                    "detach() to continue from their present states, and use reset and set_state of this "
+                    "object"
                 )
             state = torch.from_numpy(now)
         self._keep(state)
@@ -265,7 +267,7 @@ class TorchVectorEnv:
     def state(self, value: Any) -> NoReturn:
         raise AttributeError(
             "state cannot be assigned, since the environments would not follow; call "
-            "reset(options={'state': ...}), or set_state with a snapshot of get_state"
+            "reset(options={'state': ...}), or set_state with a snapshot from get_state"
         )
 
     @property
@@ -280,8 +282,8 @@ class TorchVectorEnv:
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start an episode in every environment, or in those of a mask; see `LagrangianVectorEnv.reset`.
 
-        `options` may hold tensors. A state that requires a gradient must be a leaf; then gradients of later
-        results reach it, but not through the observations returned here.
+        `options` may hold tensors. A state that requires a gradient must be a leaf. Gradients of later
+        results then reach this state, but not through the observations returned here.
 
         Returns
         -------
@@ -299,7 +301,7 @@ class TorchVectorEnv:
             if state.requires_grad and not state.is_leaf:
                 raise ValueError(
                     "options['state'] is the result of other operations: give state.detach(), or use "
-                    "lag_envs.torch.Step for gradients through it"
+                    "lag_envs.torch.Step for gradients through these operations"
                 )
         before = self._before(mask)
         observations, infos = self.envs.reset(seed=seed, options=_plain(given) or None)
@@ -324,7 +326,7 @@ class TorchVectorEnv:
     def set_state(self, snapshot: Snapshot, mask: Any = None) -> None:
         """Restore the state in which `get_state` was called; see `LagrangianVectorEnv.set_state`.
 
-        No gradient flows to what came before, in the environments that are set.
+        In the environments that are set, no gradient flows to earlier steps.
 
         Parameters
         ----------
@@ -348,7 +350,8 @@ class TorchVectorEnv:
         Parameters
         ----------
         actions : Tensor, shape (num_envs, n_actions)
-            Actions, float32 or float64; finite values outside their space are clipped; their gradient is 0.
+            Actions, float32 or float64; finite values outside their space are clipped, and their gradient is
+            then 0.
 
         Returns
         -------
@@ -359,12 +362,12 @@ class TorchVectorEnv:
         terminations, truncations : Tensor of bool, shape (num_envs,)
             Whether episodes end.
         infos : dict
-            As Gymnasium defines them, as NumPy arrays.
+            The infos that Gymnasium defines, as NumPy arrays.
 
         Raises
         ------
         ValueError, TypeError
-            For actions of another shape, type or device, or that are not finite; then nothing is stepped.
+            For actions that have another shape, type or device, or are not finite; then nothing is stepped.
         ResetNeeded, StepRefused
             As `LagrangianVectorEnv.step` does.
         """
@@ -394,15 +397,16 @@ class TorchVectorEnv:
             self.envs.close()
 
     def _before(self, mask: Any) -> Tensor | None:
-        """Return the states of which a mask leaves some; None without a mask, or before the first reset."""
+        """Return the states, some of which a mask keeps; None without a mask, or before the first reset."""
         return None if mask is None or not len(self._state) else self.state
 
     def _keep(self, state: Tensor, before: Tensor | None = None, mask: Any = None) -> None:
-        """Take the present states, with their history; outside a mask that of the states before."""
+        """Store the present states with their history; outside a mask, with the history of the states
+        before."""
         assert isinstance(self.envs, LagrangianVectorEnv)
         if before is not None:
             state = torch.where(torch.as_tensor(mask)[:, None], state, before)
-        if state.is_inference():  # such tensors could not be differentiated later
+        if state.is_inference():  # inference tensors could not be differentiated later
             with torch.inference_mode(False):
                 state = state.clone()
         self._state, self._moment = state, (*self.envs.moment, state._version)
@@ -450,8 +454,8 @@ class _RowStep(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> NoReturn:
         raise NotImplementedError(
-            "a step has no forward mode and no second derivatives: use jacrev in place of jacfwd, and leave "
-            "out jvp and hessian"
+            "a step has no forward mode and no second derivatives: use jacrev in place of jacfwd, and avoid "
+            "jvp and hessian"
         )
 
     @staticmethod
@@ -501,7 +505,8 @@ class _EnvStep(torch.autograd.Function):
         envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.set_materialize_grads(False)
-        #: Environments whose episode was over, which take no step; and those in which another one has begun.
+        #: Environments whose episode was over, which take no step; and those in which another episode has
+        #: begun.
         ended = envs.ended
         ctx.waiting = ctx.begun = np.flatnonzero(() if ended is None else ended)
         ctx.clock = envs.clock if envs.task.draws else None
@@ -535,7 +540,7 @@ class _EnvStep(torch.autograd.Function):
         after = ends
         if task.draws:
             ends = after - model.kicks(*ctx.clock)
-        if begun is not waiting:  # there the end of the step is not known
+        if begun is not waiting:  # where another episode has begun, the end of the step is not known
             random = ctx.targets is not None and task.fixed_target is None
             actions = a[begun, 0] if a.shape[1] == 1 else a[begun]
             ends = _replaced(ends, begun, model(y[begun], actions, ctx.targets[begun] if random else None)[0])
@@ -549,7 +554,7 @@ class _EnvStep(torch.autograd.Function):
 
 
 def _replaced(x: NDArray[Any], rows: NDArray[np.intp], values: Any) -> NDArray[Any]:
-    """Return an array with other values in some rows, itself if there are none."""
+    """Return an array with other values in some rows, or the array itself if there are no such rows."""
     if len(rows):
         x = np.array(x)
         x[rows] = values
@@ -557,7 +562,7 @@ def _replaced(x: NDArray[Any], rows: NDArray[np.intp], values: Any) -> NDArray[A
 
 
 def _plain(value: Any) -> Any:
-    """Return tensors, also those in a mapping, as arrays; others unchanged."""
+    """Return tensors, including those in a mapping, as arrays, and other values unchanged."""
     if isinstance(value, Mapping):
         return {name: _plain(v) for name, v in value.items()}
     return value.detach().numpy() if isinstance(value, Tensor) else value
@@ -592,11 +597,11 @@ def _checked_task(task: Any) -> Task:
         raise TypeError(f"task must be an id, a class or a Task, got {task!r:.60}")
     name = task.id or type(task).__name__
     if task.formulas.choices:
-        raise ValueError(f"{name} has a list of actions to choose from, which have no derivatives")
+        raise ValueError(f"{name} has a list of actions to choose from; choices have no derivatives")
     if task.imperfections:
         raise ValueError(
-            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, which have no "
-            "derivatives; leave these keywords out, or take the id without them"
+            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, for which there are "
+            "no derivatives; leave these keywords out, or take an id without them"
         )
     return task
 
@@ -604,7 +609,7 @@ def _checked_task(task: Any) -> Task:
 def _check(name: str, x: Any, shape: tuple[int, ...], *, whole: bool = False) -> None:
     """Raise an error unless x is a tensor of real numbers on the CPU of this shape.
 
-    A shape of one number is that of the last axis only, unless it is said to be the `whole` shape.
+    A shape of one number applies to the last axis only, unless it is the `whole` shape.
     """
     if not isinstance(x, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")

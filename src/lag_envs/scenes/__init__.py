@@ -1,6 +1,6 @@
 """Physics: parameters and energies of the scenes, and what follows from them.
 
-`Scene` is the base class of your own scenes: a scene states its energies, and everything else follows.
+`Scene` is the base class for your own scenes: a scene states its energies, and everything else follows.
 """
 
 from lag_envs.scenes.acrobot import Acrobot

@@ -37,7 +37,7 @@ class Acrobot(Scene):
     mass_1, mass_2 : float [kg]
         Masses m of the links.
     length_1, length_2 : float [m]
-        Lengths l of the links; the second link's is only drawn.
+        Lengths l of the links; that of the second link only matters for pictures.
     com_distance_1, com_distance_2 : float [m], optional
         Distances c from a link's upper joint to its centre of mass; by default half its length.
     inertia_1, inertia_2 : float [kg m²], optional

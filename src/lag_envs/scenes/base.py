@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: If a motion is singular, or a number too large, only the results of that state are not finite.
+#: If the motion is singular or a number is too large, only the results of that state are not finite.
 _QUIET = np.errstate(all="ignore")
 
 
 class SceneType(ABCMeta):
-    """The type of scenes: makes a class a frozen dataclass on first use, unless it is one already."""
+    """The type of scenes; on first use it makes a class a frozen dataclass, unless it already is one."""
 
     def __call__(cls, *args: Any, **keywords: Any) -> Any:
         """Return a scene with checked parameters and formulas."""
@@ -64,9 +64,9 @@ class SceneType(ABCMeta):
             raise TypeError(f"{error}; {hint(unknown[0], fields)}") from None
         except dataclasses.FrozenInstanceError as error:
             raise FormulaError(
-                f"{cls.__name__}: {error}, scenes never change; a class declares its numbers instead of "
-                "setting them, as in `mass: float = parameter(1.0, 'kg')`; a function of the scene in place "
-                "of 1.0 computes what follows from others"
+                f"{cls.__name__}: {error}, because scenes never change; declare the numbers of a class "
+                "instead of setting them, as in `mass: float = parameter(1.0, 'kg')`; to compute a number "
+                "from other parameters, give a function of the scene in place of 1.0"
             ) from error
         admit(scene, Scene)
         return scene
@@ -102,12 +102,14 @@ class Scene(metaclass=SceneType):
             def applied(self, q, v, u, xp):
                 return {"theta": u.torque}
 
-    ``q``, ``v`` and ``u`` go by name, by index and in order. The order of ``q`` and ``v`` is not the state's:
-    the free coordinates come first, then the prescribed ones, each as declared.
+    The entries of ``q``, ``v`` and ``u`` can be accessed by name, by index and in order. The order of ``q``
+    and ``v`` differs from that of the state: the free coordinates come first, then the prescribed ones, both
+    in the order in which they are declared.
 
     Formulas use ``+ - * /``, whole powers and functions of ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log.
-    They are run on recorded numbers, so they cannot branch on them. Fields that are not a `parameter`, such
-    as a number of bars, are structural: formulas may branch on them, and a new value needs a new compilation.
+    Formulas are run on recorded numbers, so they cannot branch on these numbers. Fields that are not a
+    `parameter`, such as a number of bars, are structural: formulas may branch on them, and a new value needs
+    a new compilation.
 
     Attributes
     ----------
@@ -117,7 +119,7 @@ class Scene(metaclass=SceneType):
         Coordinates that are moved from outside.
     controls : mapping from str to str
         Controls and their units. ``s_ddot``, ``s_dot`` or ``s`` sets the acceleration, the rate or the place
-        of a prescribed coordinate ``s``; any other acts in `applied` or `dissipation`.
+        of a prescribed coordinate ``s``; any other control acts in `applied` or `dissipation`.
     modes : mapping from str to mapping
         In place of `controls`: several sets of controls, chosen by the keyword ``control``.
     reactions : mapping from str to str
@@ -166,7 +168,7 @@ class Scene(metaclass=SceneType):
         return {}
 
     def bodies(self) -> Any:
-        """Return shapes by frame, from back to front: of a body, an indicator, or the fixed "ground"."""
+        """Return shapes by frame (a body, an indicator, or the fixed "ground"), from back to front."""
         return {}
 
     def indicators(self, now: Any, xp: Any) -> Any:
@@ -182,16 +184,16 @@ class Scene(metaclass=SceneType):
         Returns
         -------
         mapping
-            By frame (x, y), (x, y, angle) or (x, y, angle, part), see `shapes.Pose`.
+            For each frame (x, y), (x, y, angle) or (x, y, angle, part); see `shapes.Pose`.
         """
         return {}
 
     def window(self) -> Window:
-        """Return the visible part of the plane: around the first body, as far as the others reach."""
+        """Return the visible part of the plane: around the first body, as far as the other bodies reach."""
         return picture.window(self)
 
     def check(self) -> None:
-        """Raise ValueError if parameters, each in its range, do not fit together."""
+        """Raise ValueError if parameters that lie in their ranges do not fit together."""
 
     # --- how a class is made -------------------------------------------------------------------------------
 
@@ -219,8 +221,9 @@ class Scene(metaclass=SceneType):
         """The derived equations, as expressions."""
         if TWIN in vars(self):
             raise FormulaError(
-                "a formula calls something derived from it; it may use only parameters and other formulas: "
-                "in a task, self.scene.kinetic and self.scene.potential for the energy"
+                "a formula calls something that is derived from the formula; formulas may use only "
+                "parameters and other formulas; in a task, self.scene.kinetic and self.scene.potential "
+                "give the energy"
             )
         found = vars(self).get("_cached_mechanics")
         if found is None:
@@ -348,8 +351,8 @@ class Scene(metaclass=SceneType):
     def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the powers of ``drive`` and ``applied`` forces, and the power lost to ``drag`` [W].
 
-        Energy changes by drive + applied - drag. If the state leaves out the rate of a coordinate, its drive
-        is the inertial force of its frame.
+        Energy changes by drive + applied - drag. If the state leaves out the rate of a coordinate, the drive
+        of this coordinate is the inertial force of its frame.
         """
         point, shape = self._point(state, control)
         return {name: _shaped(value, shape) for name, value in point.power().items()}
@@ -406,9 +409,10 @@ class Scene(metaclass=SceneType):
         dt : float
             Length of a step [s].
         lag : float or mapping from str to float, optional
-            Time constant τ of the actuators [s], or of each by its control's name: the applied control u
-            follows the given one, w, by u' = (w - u)/τ. 0 means no lag; other values must be at least
-            1e-6 dt. Every scene is then stepped by the general series, even one with a closed form.
+            Time constant τ of the actuators [s], or a mapping from names of controls to time constants: the
+            applied control u follows the given control w by u' = (w - u)/τ. 0 means no lag; other values must
+            be at least 1e-6 dt. Every scene is then stepped by the general series, even one with a closed
+            form.
         applied : array_like, shape (n_controls,) or (), optional
             Lagged controls at the start; by default they are 0.
 
@@ -453,13 +457,13 @@ class Scene(metaclass=SceneType):
         Returns
         -------
         StepBound
-            Substeps, order, and for each entry of the state a proved bound on the truncation error, summed
-            over the substeps. Rounding, and the growth of earlier substeps' errors along the motion, are not
-            included. The bound of w, where a rate is held, follows from those of place and velocity to first
-            order. The bound of a pendulum is proved before the step, for plain substeps; if heavy damping
-            makes it follow the slow manifold instead, accuracy is tested, not proved. A mass with
-            linear drag and the turning slope are stepped to rounding: in closed form, or by a series whose
-            remainder is below rounding.
+            The number of substeps, the order, and for each entry of the state a proved bound on the
+            truncation error, summed over the substeps. Rounding, and the growth of earlier substeps' errors
+            along the motion, are not included. Where a rate is held, the bound of w follows from those of
+            place and velocity to first order. The bound of a pendulum is proved before the step, for plain
+            substeps; if heavy damping makes the step follow the slow manifold instead, accuracy is tested,
+            not proved. A mass with linear drag and the turning slope are stepped to rounding: in closed form,
+            or by a series whose remainder is below rounding.
 
         Raises
         ------
@@ -490,7 +494,8 @@ class Scene(metaclass=SceneType):
     ) -> tuple[Array, ...]:
         """Return the derivatives of the state after a control step with respect to state and controls.
 
-        The derivatives come from the step's own series. Where they need shorter substeps, they take them.
+        The derivatives come from the step's own series. Where they need shorter substeps, the step is divided
+        further.
 
         Parameters
         ----------
@@ -501,8 +506,8 @@ class Scene(metaclass=SceneType):
         dt : float
             Length of the step [s].
         parameters : sequence of str, optional
-            Names of parameters with respect to which derivatives are wanted too. All others are held, even
-            those whose default would follow them.
+            Names of parameters with respect to which derivatives are wanted too. All other parameters are
+            held, even those whose default is computed from the named ones.
 
         Returns
         -------
@@ -517,7 +522,8 @@ class Scene(metaclass=SceneType):
         ------
         ValueError, StepRefused
             As `simulate` does; StepRefused also if only the derivatives cannot be found, ValueError also for
-            a parameter that the scene lacks, or that the motion is not differentiable in, as may happen at 0.
+            a parameter that the scene lacks, or in which the motion is not differentiable, as may happen at
+            0.
 
         Examples
         --------
@@ -539,8 +545,8 @@ class Scene(metaclass=SceneType):
     ) -> tuple[Array, ...]:
         """Pull a gradient back through a control step (vector-Jacobian product).
 
-        This is reverse mode: the product of `cotangent` with each result of `jacobian`, for each row, but
-        faster.
+        This is reverse mode: for each row it returns the product of `cotangent` with each result of
+        `jacobian`, but computes it faster.
 
         Parameters
         ----------
@@ -593,11 +599,12 @@ class Scene(metaclass=SceneType):
         recordings : sequence of (states, controls, dt)
             ``states``, shape (N, n_state), at equal intervals ``dt`` [s]; NaN where nothing was measured,
             for single samples or a whole column. Angles measured within one turn may jump by 2π.
-            ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; one
-            more for the last sample is allowed and ignored. None if all are 0, or there is none.
+            ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; a
+            further one for the last sample is allowed and ignored. None if all controls are 0, or the scene
+            has none.
         free : sequence of str
-            The parameters to find. The search begins with the scene's values. Others are held, except
-            parameters that have the default value computed from others: they keep following those.
+            The parameters to find. The search begins with the scene's values. Other parameters are held,
+            except those whose value is a default computed from other parameters: they keep following these.
         noise : mapping from str to float, optional
             Standard deviation of the measurements of each state, as in ``{"theta": 0.01}``. By default it is
             estimated for each state.
@@ -619,9 +626,9 @@ class Scene(metaclass=SceneType):
         Raises
         ------
         ValueError
-            For data that do not determine the parameters, naming these; for parameters that grow without
-            bound because the model is wrong; for a parameter that the scene lacks; for recordings of a wrong
-            shape, with too few values, or with controls that are not finite.
+            For data that do not determine the parameters, which the error then names; for parameters that
+            grow without bound because the model is wrong; for a parameter that the scene lacks; for
+            recordings of a wrong shape, with too few values, or with controls that are not finite.
         StepRefused
             If the motion cannot be simulated with the initial parameters. A coordinate that was not measured
             is first guessed to be 0; the error then names it.
@@ -665,17 +672,17 @@ class Scene(metaclass=SceneType):
             The energies [J], and Rayleigh's function [W].
         coordinates, prescribed, controls : dict from symbol to str
             Free and prescribed coordinates and controls with their units. The velocity of a function of time
-            is its derivative, ``theta.diff(t)``; that of a plain symbol ``theta`` is ``theta_dot``. A text
+            is its derivative, ``theta.diff(t)``; that of a plain symbol ``theta`` is ``theta_dot``. A string
             stands for the symbol of that name.
         applied : dict from symbol to expression, optional
             Generalised forces by coordinate.
         parameters : dict from symbol to float
-            All other symbols with their numbers.
+            All other symbols with their values.
 
         Returns
         -------
         Scene
-            A scene with these numbers. Call it to change some: ``scene(m=2.0)``.
+            A scene with these values. Call it to change some of them: ``scene(m=2.0)``.
 
         Examples
         --------

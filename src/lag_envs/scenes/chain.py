@@ -8,14 +8,14 @@ r"""A chain of equal bars hanging from a moving support.
                 \  l    theta_1, theta_2, ...   angles of the bars from straight down,
                  o                              positive counter-clockwise
                  |
-                 |      the support is at (s, rise); `rise` rests at 0 and is there for the vertical force
+                 |      the support is at (s, rise); `rise` rests at 0 and serves to derive the vertical force
 
 With the joints J₁ = (s, rise) and J_{i+1} = J_i + l (sin(theta_i), -cos(theta_i)), and centres of mass at the
 distance c along each bar from its upper joint::
 
     T = Σ m |G_i'|²/2 + I theta_i'²/2,   V = Σ m g y(G_i)
 
-One bar is a `PivotedBar`.
+A chain of one bar is a `PivotedBar`.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from lag_envs.mechanics.recording import parameter_names
 
 Array = NDArray[np.float64]
 
-#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must
-#: neither vanish nor overflow.
+#: Masses and lengths below this, and any parameter above its inverse, are refused: the product of five such
+#: numbers must neither vanish nor overflow.
 SMALLEST = 1e-60
 
 
@@ -68,7 +68,7 @@ def real_array(name: str, values: ArrayLike) -> Array:
 
 
 def is_masked(values: Any) -> bool:
-    """Return whether values are or hold a masked array; NumPy would take masked numbers for valid ones."""
+    """Return whether values are or contain a masked array; NumPy would take masked numbers for valid ones."""
     if isinstance(values, list | tuple):
         return any(map(is_masked, values))
     return isinstance(values, np.ndarray) and hasattr(values, "mask")
@@ -113,7 +113,8 @@ def check_states(scene: Any, states: ArrayLike) -> Array:
 def check_controls(scene: Any, control: ArrayLike, ndim: int) -> Array:
     """Return controls as a float64 array of shape (..., n_controls), or raise a ValueError.
 
-    A single control may be given without its axis; `ndim`, that of the states, shows whether it was.
+    A single control may be given without its axis; `ndim`, the number of axes of the states, shows whether it
+    was.
     """
     array, names = real_array("the control", control), scene.control_names
     bad = ~np.isfinite(array)
@@ -141,7 +142,7 @@ def check_control(scene: Any, control: ArrayLike) -> Array:
 
 
 def check_both(scene: Any, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    """Return states and controls with their last axes, and their common shape without these."""
+    """Return states and controls with their last axes, and their common shape without the last axes."""
     states = check_states(scene, state)
     controls = check_controls(scene, control, states.ndim)
     try:
@@ -223,8 +224,8 @@ def check_lags(names: tuple[str, ...], lag: Any, dt: float) -> Array:
         seconds = check_number(what, value, "s")
         if seconds != 0.0 and not seconds >= SMALLEST_LAG * dt:
             raise ValueError(
-                f"{what} must be 0 or at least {SMALLEST_LAG:g} of the step of {dt:g} s, got {seconds:g} s; "
-                "0 is no lag"
+                f"{what} must be 0 or at least {SMALLEST_LAG:g} times the step of {dt:g} s, "
+                f"got {seconds:g} s; 0 means no lag"
             )
         decays[name] = 1.0 / seconds if seconds else 0.0
     return np.array([decays[name] for name in names])

@@ -14,9 +14,8 @@ If it rolls, the cylinder turns at Omega = (R psi' - a theta' + slip')/r::
     T = m ((a - gap)² theta'² + gap'²)/2 + I Omega²/2,   V = -m g (a - gap) cos(theta)
 
 `gap` and `slip` rest at 0; they exist so that the contact's forces can be derived. A round shell has no
-orientation: a static tilt has no effect; its acceleration drives the cylinder. Drag acts at the small
-cylinder's axis, like that of a medium that turns with the shell. The shell's own inertia is not part of the
-scene.
+orientation, so a static tilt has no effect; the shell's acceleration drives the cylinder. Drag acts at the
+small cylinder's axis, as if a medium turned with the shell. The shell's own inertia is not part of the scene.
 """
 
 from __future__ import annotations
@@ -54,9 +53,9 @@ class CylinderInCylinder(Scene):
     radius : float [m]
         Radius r of the small cylinder, below `shell_radius`.
     inertia : float [kg m²], optional
-        Moment of inertia I of the small cylinder about its axis; by default solid, mr²/2.
+        Moment of inertia I of the small cylinder about its axis; by default that of a solid cylinder, mr²/2.
     damping : float [N m s]
-        Coefficient c of the drag -c(θ' - ψ'). It adds to drag that is the control.
+        Coefficient c of the drag -c(θ' - ψ'). It is added to the drag that the control sets.
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt"}

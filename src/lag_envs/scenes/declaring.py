@@ -25,8 +25,8 @@ ORDER = "_order_of_task"
 DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
 
 
-# If a class is sent to another process by value before its first use, its fields are sent too, and with them
-# this marker. It is recognised by identity: a copy would be taken for a default value.
+# If a class is sent to another process by value before its first use, its fields are sent too, and this
+# marker with them. The marker is recognised by identity, so a copy of it would be taken for a default value.
 copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
 
 
@@ -55,8 +55,8 @@ def complete(cls: type) -> None:
         for name in own_annotations(cls):  # a class that is made by code may have names of any kind
             if not name.startswith("_"):
                 check_name(cls.__name__, name)
-        # For annotations that are texts, a dataclass looks into the class's module. A class that was sent to
-        # another process by value may have none there.
+        # For annotations that are texts, a dataclass looks into the class's module. That module may be
+        # missing in a process to which the class was sent by value.
         absent = cls.__module__ not in sys.modules
         if absent:
             sys.modules[cls.__module__] = ModuleType(cls.__module__)

@@ -1,7 +1,7 @@
 """What follows from a scene and stays inside the package: its layout, its constants, the code of its steps.
 
-These are functions, not attributes, so that scenes may use any name for a parameter. What takes long to
-compute is kept with the scene, under a name with an underscore.
+These are functions, not attributes, so that scenes may use any name for a parameter. Results that take long
+to compute are kept with the scene, under names with an underscore.
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ def layout_of(scene: Scene) -> SceneLayout:
 
 
 def structure_of(scene: Scene) -> tuple:
-    """Return everything that decides the code of a step; scenes that agree in it differ only in numbers."""
+    """Return everything that decides the code of a step; scenes with the same result differ only in
+    numbers."""
     cls, numbers = type(scene), parameter_names(scene)
-    # By identity: keeping a formula that calls super() would keep its own class alive.
+    # Formulas are compared by identity, because keeping a formula that calls super() would keep its class
+    # alive.
     formulas = tuple(id(getattr(cls, name)) for name in ("rests", *recording.ARGUMENTS))
     fields = dataclasses.fields(scene)  # type: ignore[arg-type]
     plain = tuple((f.name, getattr(scene, f.name)) for f in fields if "unit" not in f.metadata)
@@ -92,12 +94,13 @@ def undefined(scene: Scene) -> str:
     """Return the message for parameters for which a formula has no value."""
     return (
         f"with these parameters a coefficient of the motion is undefined or not finite: {scene}; "
-        "choose others, and state their range in the class"
+        "choose other values, and declare the range of the parameters in the class"
     )
 
 
 def _stepper(scene: Scene, lagged: bool) -> Any:
-    """Return what steps the scene: its normal form or the general series, always the latter if lagged."""
+    """Return what steps the scene: its normal form or the general series; a lagged step always uses the
+    series."""
     if lagged:
         from lag_envs.stepping.lag import lagged_stepper
 
@@ -123,7 +126,7 @@ def series_order_of(scene: Scene, dt: float) -> int:
 
 
 def step_argument_of(scene: Scene, dt: float, lagged: bool = False) -> float:
-    """Return the argument of a step besides dt: the largest x of one series, or the series' order."""
+    """Return the argument of a step besides dt: the largest x of one series, or the order of the series."""
     form = None if lagged else form_of(scene)
     return form.largest_majorant(dt) if form else float(series_order_of(scene, dt))
 

@@ -26,9 +26,10 @@ from lag_envs.scenes.declaring import DEFINED, own_annotations
 from lag_envs.scenes.derivation import layout_of, structure_of
 from lag_envs.scenes.parameters import fill_in
 
-#: A mass matrix whose smallest eigenvalue is below this, its diagonal scaled to 1, counts as singular.
+#: A mass matrix, scaled to a diagonal of 1, counts as singular if its smallest eigenvalue is below this.
 SINGULAR = 1e-13
-#: One below this makes the certificate coarse, as it bounds the inverse entry by entry.
+#: If the smallest eigenvalue is below this, the certificate is coarse, because it bounds the inverse entry by
+#: entry.
 ILL_CONDITIONED = 1e-3
 
 #: Layouts and equations of scenes that passed the checks: by class, and by `structure_of`.
@@ -38,7 +39,7 @@ _admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[SceneLayout, Mechan
 
 
 def is_own(kind: type) -> bool:
-    """Return whether a class is the package's own: then its structure alone decides its formulas' results.
+    """Return whether a class is the package's own; then only its structure decides its formulas' results.
 
     Other people's formulas may use names defined outside, which can change.
     """
@@ -84,7 +85,7 @@ def admit(scene: Any, base: type) -> None:
 
 
 def check_class(cls: type, base: type) -> None:
-    """Raise a FormulaError for faults of a class that show before there is a scene."""
+    """Raise a FormulaError for faults of a class that can be seen before a scene is made."""
     of = cls.__name__
     for c in cls.__mro__[: cls.__mro__.index(base)]:
         if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
@@ -154,8 +155,8 @@ def _check_bodies(scene: Any) -> None:
 def _check_on_numbers(scene: Any, found: Mechanics) -> None:
     """Raise a FormulaError if a formula gives something else on plain numbers than what was recorded.
 
-    It does if it asks for a parameter's type or text. It is tried at two points. An allowance is made for
-    rounding: where terms cancel in the record, plain numbers may leave a little.
+    This happens if a formula asks for a parameter's type or text. Each formula is tried at two points. An
+    allowance is made for rounding: where terms cancel in the record, plain numbers may leave a little.
     """
     layout, parameters = found.layout, recording.parameter_values(scene)
     largest = max(map(abs, parameters.values()), default=0.0)
@@ -217,9 +218,9 @@ def _check_motion(scene: Any, found: Mechanics) -> None:
 
 
 def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> float:
-    """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, at its largest.
+    """Return the smallest eigenvalue of the mass matrix, scaled to a diagonal of 1, where it is largest.
 
-    Or the first that is large enough.
+    The search ends at the first eigenvalue that is large enough.
     """
     n = len(found.free)
     values = {recording.parameter(name): number(getattr(scene, name)) for name in parameter_names(scene)}
@@ -243,6 +244,6 @@ def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> 
 
 
 def smallest_eigenvalue(mass: NDArray[np.float64]) -> float:
-    """Return the smallest eigenvalue of a mass matrix, its diagonal scaled to 1."""
+    """Return the smallest eigenvalue of a mass matrix that is scaled to a diagonal of 1."""
     size = np.sqrt(np.abs(np.diag(mass)))
     return float(np.linalg.eigvalsh(mass / np.outer(size, size))[0]) if size.all() else 0.0

@@ -12,11 +12,11 @@ from typing import Any
 
 from lag_envs.scenes.derivation import layout_of
 
-#: Operations of a Lagrangian up to which its equations of motion are written out.
+#: The equations of motion are written out if the Lagrangian has at most this many operations.
 LONGEST = 150
-#: A name whose last part, a number or a letter, is an index; in "rest_length" all of it is a name.
+#: A name whose last part, a number or a letter, is an index; "rest_length" as a whole is a name.
 SUBSCRIPT = re.compile(r"(.*[^\W\d_])(?:_?(\d+)|_([^\W\d_]))")
-#: Browsers set exponents above the whole of a letter with dots; with this height they forget the dots.
+#: Browsers set an exponent above a letter together with its dots; with this height they ignore the dots.
 HEIGHT = "0.7em"
 NO_BREAK = "\N{NO-BREAK SPACE}"
 LOW = f'<mpadded height="{HEIGHT}">'
@@ -48,7 +48,7 @@ def scene_html(scene: Any) -> str:
         f"{name} [{unit}]" for name, unit in zip(scene.control_names, scene.control_units, strict=True)
     )
     about = (inspect.getdoc(type(scene)) or "").partition("\n")[0]
-    # A dataclass without a docstring gets its signature as one.
+    # A dataclass without a docstring gets its signature as its docstring.
     if about.startswith(f"{type(scene).__name__}("):
         about = ""
     rows = [("State", state), ("Controls", controls or "none")]
@@ -59,7 +59,7 @@ def scene_html(scene: Any) -> str:
 
 
 def _equations(scene: Any) -> str:
-    """Return Lagrangian and equations of motion, or a hint at what they need."""
+    """Return the Lagrangian and the equations of motion, or a hint at what is missing for them."""
     if find_spec("sympy") is None:
         return '<p>Its equations need SymPy: <code>pip install "lag-envs[symbolic]"</code></p>'
     import sympy
@@ -97,7 +97,7 @@ def mathml(expression: Any, behind: str = "") -> str:
     from sympy.printing.pretty.pretty_symbology import greek_unicode
 
     class Printer(MathMLPresentationPrinter):
-        """Writes names that end in primes with dots above them, and subscripts below exponents."""
+        """Writes names that end in primes with dots above them, and puts subscripts below exponents."""
 
         def _element(self, name: str, *children: Any) -> Any:
             made = self.dom.createElement(name)
@@ -150,7 +150,7 @@ def mathml(expression: Any, behind: str = "") -> str:
 
 
 def wrapped_mathml(parts: Sequence[str]) -> str:
-    """Return the parts of a formula, in MathML, as formulas between which a line may end.
+    """Split a formula in MathML into formulas between which a line may end.
 
     Browsers do not break formulas. A part that is not the first begins with its operator.
     """

@@ -41,10 +41,10 @@ class Incline(Scene):
     inertia : float [kg m²], optional
         Moment of inertia I about the axis; by default that of a solid cylinder, mR²/2.
     damping : float [N s/m]
-        Coefficient c of the drag -cx' at the axis. It adds to drag that is the control.
+        Coefficient c of the drag -cx' at the axis. It is added to the drag that the control sets.
     tilt : float [rad], optional
-        Fixed tilt φ, at most π/2 to either side, where the plane is vertical; 0.26 by default. Only for the
-        control "damping".
+        Fixed tilt φ, at most π/2 to either side, at which the plane is vertical; 0.26 by default. It is only
+        for the control "damping".
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt", "tilt_rate"}
@@ -54,8 +54,8 @@ class Incline(Scene):
     Notes
     -----
     State (x, x_dot); for the control "tilt_rate" (x, w, phi) with w = x' + Rφ'. The zero of the potential
-    energy lies at the height of the point x = 0 of the surface. Friction is positive if it speeds up the
-    rotation of rolling down and slows the motion down the slope.
+    energy lies at the height of the point x = 0 of the surface. Friction is positive if it slows the motion
+    down the slope and speeds up the rotation of a cylinder that rolls down.
 
     Examples
     --------

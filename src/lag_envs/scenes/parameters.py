@@ -35,7 +35,7 @@ def parameter(
     unit : str
         Its unit, for tables and error messages.
     above, least, below, most : float, optional
-        Its range: above, at least, below, at most.
+        Its range: a value must be above `above`, at least `least`, below `below` and at most `most`.
     usable : (float, float)
         The range in which an environment is usable, whatever its other parameters; see `Task.usable`. The
         scene alone may be stepped beyond it.
@@ -50,7 +50,7 @@ def parameter(
     for (low, bottom), (high, top) in itertools.product(lows.items(), highs.items()):
         strict = low == "above" or high == "below"
         if bottom is not None and top is not None and (bottom > top or (strict and bottom == top)):
-            raise FormulaError(f"no parameter is {low} {bottom:g} and {high} {top:g}")
+            raise FormulaError(f"no value is {low} {bottom:g} and {high} {top:g}")
     if usable[0] > usable[1]:
         raise FormulaError(f"usable must be (lowest, highest), in this order, got {usable!r}")
     made = callable(default)
@@ -102,7 +102,7 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
 
 
 def _check_made(field: dataclasses.Field, value: Any) -> float:
-    """Return a value computed from other parameters; it may be smaller or larger than a given one."""
+    """Return a value computed from other parameters; it may be smaller or larger than a given one may be."""
     shown, number = _shown_unit(field), check_number(field.name, value)
     for rule, limit, broken in _rules(field, number):
         if broken:
@@ -114,7 +114,7 @@ def _check_made(field: dataclasses.Field, value: Any) -> float:
 
 
 def _shown_unit(field: dataclasses.Field) -> str:
-    """Return a parameter's unit as it follows a number."""
+    """Return a parameter's unit as it is written after a number."""
     unit = field.metadata["unit"]
     return "" if unit in ("", "1") else f" {unit}"
 

@@ -1,4 +1,4 @@
-"""The picture of a scene, or of a task on it: shapes in frames, and the frames' poses at a moment."""
+"""The picture of a scene or of a task: shapes in frames, and the poses of the frames at a moment."""
 
 from __future__ import annotations
 
@@ -113,7 +113,8 @@ class Picture:
         n, columns = len(array), list(array.T)
         held = np.zeros((n, len(self._scene.control_names)))
         held[1:] = np.reshape(controls, held[1:].shape)
-        # Exact if the rates are linear between two states, as for a coordinate with held acceleration.
+        # This is exact if the rates are linear between two states, as for a coordinate with held
+        # acceleration.
         turned = []
         for rate in left_out_rates(self._scene, columns):
             rates = np.broadcast_to(rate, n)
@@ -130,7 +131,7 @@ class Picture:
         return self.view.moved(frame[0], frame[1])
 
     def placed(self, now: Frame) -> list[Shape]:
-        """Return the visible shapes at a moment, from back to front."""
+        """Return the shapes that are visible at a moment, from back to front."""
         poses = self.poses(now)
         view = self.window(poses)
         return [part for frame, shape in self.shapes for part in placed(shape, poses[frame], view)]
@@ -238,7 +239,7 @@ def places(scene: Scene, now: Frame) -> dict[str, Any]:
 def window(scene: Scene, lengths: Mapping[str, float] = MappingProxyType({})) -> Window:
     """Return a window that follows the first body and contains the others' reach.
 
-    It is as wide as if all lengths were at most as large as the bodies, or as given by name.
+    Its width assumes that every length is at most as large as the bodies, or as large as given by name.
     """
     size, first = 1.15 * _reach(scene, tuple(lengths.items())), next(iter(scene.mechanics.record.poses), "")
     return Window(-size, -size, size, size, first)

@@ -13,7 +13,7 @@ The support A is at (s, rise), the centre of mass G at distance L from it, I is 
     T = m |G'|²/2 + I theta'²/2,   G' = (s' + L theta' cos(theta), rise' + L theta' sin(theta))
     V = m g (rise - L cos(theta))
 
-`rise` rests at 0; it is there so that the support's vertical force follows.
+`rise` rests at 0; it exists so that the support's vertical force can be derived.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class PivotedBar(Scene):
 
     Notes
     -----
-    State (s, s_dot, theta, theta_dot), without track (theta, theta_dot). Control s'' [m/s²]. The zero of the
-    potential energy lies at the pivot. Without track the energy is that in the support's frame.
+    State (s, s_dot, theta, theta_dot); without a track (theta, theta_dot). Control s'' [m/s²]. The zero of
+    the potential energy lies at the pivot. Without a track, the energy is that in the support's frame.
 
     Examples
     --------

@@ -50,8 +50,8 @@ class RotaryPendulum(Scene):
     Notes
     -----
     State (phi, phi_dot, theta, theta_dot). Control: torque [N m]. The zero of the potential energy lies at
-    the hinge. The default sizes are those of desktop apparatus. Pictures show two views side by side: on the
-    left the arm, seen from above; on the right the pendulum, seen along the arm that carries it.
+    the hinge. The default sizes are those of a desktop apparatus. Pictures show two views side by side: on
+    the left the arm, seen from above; on the right the pendulum, seen along the arm that carries it.
     """
 
     arm_length: float = parameter(0.2, "m", above=0.0)

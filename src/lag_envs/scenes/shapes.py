@@ -1,7 +1,8 @@
 """What a scene and a task look like: plain data in metres, x to the right and y up.
 
-A shape lies in a frame, and a pose says where the frame is at a moment. A painter needs nothing else: it
-transforms and paints. A shape names its role, not its colour; the painter decides how a role looks.
+A shape lies in a frame, and a pose says where the frame is at a moment. A painter needs nothing else; it
+transforms the shapes and paints them. A shape names its role, not its colour; the painter decides how a role
+looks.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Ruler(NamedTuple):
 
 
 class Magnifier(NamedTuple):
-    """A round part of the picture [m] that is shown a second time, magnified."""
+    """A round part of the picture [m] that is shown again, magnified."""
 
     centre: Point
     radius: float
@@ -80,8 +81,8 @@ class Pose(NamedTuple):
     angle : float [rad]
         Its rotation, counter-clockwise.
     part : float
-        The visible part of its lines and arrows, measured from their start. A negative part shows the frame's
-        mirror image, with -y for y: an arrow along the y axis then points the other way.
+        The visible part of the frame's lines and arrows, measured from their start. A negative part shows the
+        mirror image of the frame, with -y for y: an arrow along the y axis then points the other way.
     """
 
     x: float
@@ -91,7 +92,7 @@ class Pose(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The visible part of the plane [m]; it moves with the origin of a frame if it names one."""
+    """The visible part of the plane [m]; if it names a frame, it moves with the origin of that frame."""
 
     left: float
     bottom: float
@@ -105,7 +106,7 @@ class Window(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """The content of a picture; with arrays in place of numbers, of many pictures.
+    """The content of a picture, or of many pictures if arrays take the place of numbers.
 
     Attributes
     ----------
@@ -114,7 +115,7 @@ class Frame(NamedTuple):
     control : float or sequence of float
         The controls applied last, in SI units.
     share : float or sequence of float
-        The same as shares of the task's largest controls; they are the lengths of arrows.
+        The same controls as shares of the task's largest controls; these are the lengths of arrows.
     target : float, sequence of float or None
         The episode's targets.
     turned : float or sequence of float
@@ -143,7 +144,7 @@ def polar(centre: Point, radius: float, angle: float) -> Point:
 
 
 def arc(centre: Point, radius: float, start: float, end: float, n: int = 0) -> list[Point]:
-    """Return points [m] along a circle between two angles [rad], in n pieces or as many as look smooth."""
+    """Return points [m] along a circle between two angles [rad], in n pieces or in enough to look smooth."""
     n = n or 1 + math.ceil(abs(end - start) / 0.1)
     return [polar(centre, radius, start + (end - start) * i / n) for i in range(n + 1)]
 
@@ -227,7 +228,7 @@ def roller(radius: float, ratio: float) -> list[Shape]:
 
 
 def half_turn(radius: float) -> Line:
-    """Return the arc that shows an angle: from the x axis, half a turn when complete."""
+    """Return the arc that shows an angle: it begins at the x axis and is half a turn long when complete."""
     return Line(arc((0.0, 0.0), radius, 0.0, math.pi), "guide")
 
 
@@ -276,6 +277,6 @@ def ticks(low: float, high: float, step: float) -> list[float]:
 
 
 def round_length(length: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is at most the length."""
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most the length."""
     power = 10.0 ** math.floor(math.log10(length))
     return power * max(step for step in (1.0, 2.0, 5.0) if step == 1.0 or step * power <= 1.000001 * length)

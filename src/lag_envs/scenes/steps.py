@@ -208,7 +208,7 @@ def pulled(
     by: tuple[str, ...],
     rows: Sequence[int] | None = None,
 ) -> Array:
-    """Return `vjp` of rows of checked arrays, also by `check_turns`; errors name the rows by `rows`.
+    """Return `vjp` for rows of arrays checked by `check_turns` too; errors take row numbers from `rows`.
 
     Rows are not finite where their cotangents are not, or are too large.
     """
@@ -263,8 +263,8 @@ def _check_refused(
         except (StepRefused, ValueError):  # the latter for a control that is not finite, from a guard
             raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {row}") from None
         raise StepRefused(
-            f"the step of row {row} can be taken, but its derivatives cannot be found: they need more than "
-            "the largest number of substeps, or are not finite; take a smaller dt"
+            f"the step of row {row} can be taken, but its derivatives cannot be computed: they need more "
+            "than the largest number of substeps, or are not finite; take a smaller dt"
         )
 
 
@@ -302,8 +302,8 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
         raise ValueError(
-            f"the motion has no derivative with respect to the parameters at {given}; leave out those that "
-            "are 0 and that a formula divides by or takes the root of"
+            f"the motion has no derivative with respect to the parameters at {given}; leave out parameters "
+            "that are 0 if a formula divides by them or takes their root"
         ) from error
     return known[by]
 
@@ -341,35 +341,35 @@ def refusal(
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
     values = np.atleast_1d(np.asarray(control, dtype=np.float64))
     held = zip(scene.control_names, values, strict=True)
-    why = "it could not be certified within the largest number of substeps, or has no finite result"
+    why = "the step could not be certified within the largest number of substeps, or has no finite result"
     remedy = "take a smaller dt or milder parameters, or, near a singular configuration, other coordinates"
     if not np.isfinite(state).all():
-        why, remedy = "the state is not finite", "reset the episode; if the task has a kick, look there"
+        why, remedy = "the state is not finite", "reset the episode; if the task has a kick, check the kick"
     elif not np.isfinite(values).all():
-        why, remedy = "the control is not finite", "if the task has a guard, look there"
+        why, remedy = "the control is not finite", "if the task has a guard, check the guard"
     elif form_of(scene) is not None and not lagged:
-        why = f"it would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
+        why = f"the step would need more than {MAX_SUBSTEPS:,} substeps, or has no finite result"
         remedy = "take a smaller dt or milder parameters"
     elif far := _far_angles(scene, state, values):
-        why = f"it needs sine and cosine of {far}, which are not computed beyond {LARGEST_ANGLE:g} rad"
+        why = f"the step needs sine and cosine of {far}, which are not computed beyond {LARGEST_ANGLE:g} rad"
         remedy = f"subtract whole turns from {far}"
     elif singular := _singular(scene, state, values):
-        why, remedy = singular, "choose other coordinates, or end or reset the episode before"
+        why, remedy = singular, "choose other coordinates, or end or reset the episode before that state"
     elif smallest_eigenvalue(scene.mass_matrix(state, values)) < ILL_CONDITIONED:
         remedy = (
-            "take a smaller dt, milder parameters, or coordinates that depend less on each other: the mass "
-            "matrix is nearly singular there"
+            "take a smaller dt, milder parameters, or coordinates that depend less on each other: at this "
+            "state the mass matrix is nearly singular"
         )
     error = StepRefused(
         f"{where} was refused: from ({start}) with "
-        f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}; {remedy}"
+        f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s, {why}; {remedy}"
     )
     error.trajectory = None if trajectory is None else trajectory.copy()
     return error
 
 
 def _singular(scene: Scene, state: Array, control: Array) -> str:
-    """Return why there is no motion from a state, or nothing."""
+    """Return the reason why there is no motion from a state, or an empty text."""
     mass = scene.mass_matrix(state, control)
     if np.isfinite(mass).all() and smallest_eigenvalue(mass) < SINGULAR:
         return f"the mass matrix of {', '.join(layout_of(scene).free)} is not positive definite there"

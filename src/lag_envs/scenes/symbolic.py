@@ -56,8 +56,8 @@ def _functions(of: Callable[[Any], Any], rational: Callable[[Any], sympy.Expr]) 
     )
 
 
-#: Namespaces ``xp`` of a formula on SymPy's expressions: one for people to read, and one in which a float is
-#: its exact value and no function is called on floats.
+#: Namespaces ``xp`` of a formula on SymPy's expressions. The first is for people to read; in the second, a
+#: float stands for its exact value, and no function is called on floats.
 Symbolic, Exact = _functions(lambda x: x, decimal), _functions(binary, binary)
 
 
@@ -73,7 +73,7 @@ def symbolic(scene: Scene) -> Any:
             ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least")
         )
         symbols[name] = sympy.Symbol(name, positive=True) if positive else sympy.Symbol(name, real=True)
-        if symbols[name] == t:  # a parameter is no time
+        if symbols[name] == t:  # a parameter is not a time
             symbols[name] = sympy.Symbol(name, real=True, polar=False)
     return twin(scene, symbols)
 
@@ -91,7 +91,7 @@ def motion_symbols(scene: Scene) -> tuple[Values, Values, Values]:
 
 
 def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
-    """Return an expression with resting coordinates at their places, and no rates of held ones."""
+    """Return an expression with resting coordinates at their places and without rates of held coordinates."""
     values: dict[Any, Any] = {}
     rests = symbolic(scene).rests()
     for p in layout_of(scene).at("rest", "place"):
@@ -188,7 +188,7 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
     expressions = dict(formulas)
     named = {what: {_name(key): value for key, value in of.items()} for what, of in given.items()}
     applied = {key: sympy.sympify(value) for key, value in named["applied"].items()}
-    # First the controls: one that sets a place or a rate is read as that place or rate.
+    # The controls come first: a control that sets a place or a rate is read as that place or rate.
     places: dict[Any, tuple[str, str]] = {symbol: ("u", _name(symbol)) for symbol in given["controls"]}
     places |= {symbol: ("self", _name(symbol)) for symbol in given["parameters"]}
     for symbol in (*given["coordinates"], *given["prescribed"]):
@@ -244,7 +244,7 @@ def _remake(base: type[Scene], name: str, items: tuple, formulas: tuple, fields:
 
 
 def _symbol(key: Any) -> Any:
-    """Return the symbol that a key of a dict stands for; a text stands for the symbol of that name."""
+    """Return the symbol that a key of a dict stands for; a string stands for the symbol of that name."""
     return sympy.Symbol(key) if isinstance(key, str) else key
 
 

@@ -13,7 +13,7 @@ length, and w = theta_1' or theta_1' + theta_2' their rates::
 
     T = Σ (m |G'|² + m l² w²/12)/2 + p |C'|²/2,   V = g (Σ m y(G) + p y(C))
 
-``gravity=0`` is an arm that moves in a horizontal plane.
+With ``gravity=0`` the arm moves in a horizontal plane.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from lag_envs.tasks.measured import measured_ids
 
 
 class Tasks(UserDict[str, Any]):
-    """Task classes by id; one given as "module:Class" is imported on first access."""
+    """Task classes by id; a class given as "module:Class" is imported on first access."""
 
     def __getitem__(self, env_id: str) -> type[Any]:
         """Return the class."""
@@ -40,9 +40,9 @@ def load_task(place: str | type[Any]) -> type[Any]:
     Raises
     ------
     UserError
-        If the module is there but fails when it is imported; it names the file.
+        If the module exists but fails when it is imported; the error names the file.
     ValueError
-        For any other place that leads to no class.
+        For any other place that does not lead to a class.
     """
     if isinstance(place, type):
         return place
@@ -62,7 +62,7 @@ def load_task(place: str | type[Any]) -> type[Any]:
 
 
 def _broken(place: Any) -> str | None:
-    """Return the file of a place's module if there is one that could not be imported."""
+    """Return the file of a place's module, if the file exists but could not be imported."""
     module = str(place).partition(":")[0]
     if module in sys.modules:
         return None

@@ -29,15 +29,15 @@ from lag_envs.tasks.formulas import UNBOUNDED, TaskFormulas, control_of
 from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
 
-#: Largest speed of a given start, so that observation bounds can be proved [rad/s or m/s]; larger ones are
+#: Largest speed of a given start, so that observation bounds can be proved [rad/s or m/s]; larger speeds are
 #: accepted where episodes start with them.
 FASTEST_START = 100.0
-#: Largest angle [rad] turned at the speed `Task.fastest` in a step. A step then needs far fewer substeps than
-#: are allowed, even after many steps have added to the speed.
+#: Largest angle [rad] that the speed `Task.fastest` may cover in a step. A step then needs far fewer substeps
+#: than are allowed, even after many steps have added to the speed.
 LONGEST_TURN = 5000.0
 #: Keywords that environments take besides those of their task.
 OF_ENVIRONMENTS = ("render_mode", "diagnostics", "show_arrows", "show_trail", "show_readout")
-#: Keywords that vector environments take besides those.
+#: Further keywords that vector environments take.
 OF_BATCHES = ("num_envs", "max_episode_steps", "autoreset_mode", "num_threads", "show_tiles")
 
 
@@ -45,14 +45,14 @@ class Task:
     """A task on a scene.
 
     A subclass defines some of the attributes and methods below, at least `scene`, `interval`, `steps`,
-    `action`, `observe` and `reward`. Formulas use names: ``before`` and ``after`` are the state at both ends
-    of the step, with the names of ``scene.state_names``; ``control`` has the applied controls, ``target`` the
-    targets. Formulas may use ``+ - * /``, integer powers, comparisons joined by ``|`` and ``&``, functions
-    of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum), and the scene's
-    parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)`` and
-    ``self.scene.kinetic(after, after.v, xp)``. ``after.q`` and ``after.v`` are the places and velocities by
-    coordinate, as the energies take them; there is no ``after.v`` of a coordinate whose velocity jumps with a
-    control: the state holds ``w`` instead.
+    `action`, `observe` and `reward`. Formulas access values by name: ``before`` and ``after`` are the states
+    at the start and end of the step, with the names of ``scene.state_names``; ``control`` has the applied
+    controls, and ``target`` has the targets. Formulas may use ``+ - * /``, integer powers, comparisons joined
+    by ``|`` and ``&``, functions of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum,
+    maximum), and the scene's parameters and energies: ``self.scene.mass``,
+    ``self.scene.potential(after, xp)`` and ``self.scene.kinetic(after, after.v, xp)``. ``after.q`` and
+    ``after.v`` are the places and velocities by coordinate, as the energies take them. A coordinate whose
+    velocity jumps with a control has no entry in ``after.v``: the state holds ``w`` instead.
 
     Attributes
     ----------
@@ -67,10 +67,11 @@ class Task:
     steps : int
         Steps of an episode.
     action : mapping
-        For each control that actions set: its limit, (low, high), or a list, array or range of values to
-        choose from.
+        For each control that actions set: its limit, a pair (low, high), or a list, array or range of values
+        to choose from.
     start : mapping
-        For entries of the state: a half width around 0, or (centre, half width). The others start at 0.
+        For entries of the state: a half width around 0, or (centre, half width). All other entries start at
+        0.
     target : mapping
         For each target: (unit, half width) or (unit, centre, half width).
     draws : int
@@ -85,9 +86,9 @@ class Task:
     unbounded : float
         Bound in the space for unbounded observations: the largest float32, or infinity.
     order : int, optional
-        Order of the series, 6 to 24; by default it follows from `dt`. Slow motions are stepped
-        faster with a lower order, fast ones with a higher one. Steps are certified with any order.
-        ``lag-envs order FILE`` measures the best.
+        Order of the series, 6 to 24; by default it follows from `dt`. Slow motions are stepped faster with a
+        lower order, fast motions with a higher order. With any order, steps are certified.
+        ``lag-envs order FILE`` finds the fastest order.
     usable : mapping
         Ranges of parameters in which the task can be used, if they differ from those that the scene declares.
         For any combination of values in these ranges that `fastest` does not forbid, every accepted start and
@@ -95,18 +96,20 @@ class Task:
     controllers : mapping
         A `record.Controller` for each of its controllers, by name. Every task also has "zero" and "random".
     reference : str
-        A quick controller among them, used as a control variate where episodes differ much.
+        The name of a quick controller among these, used as a control variate where episodes differ much.
     imperfections : mapping
         Keywords of imperfect sensors and actuators and of hidden parameters (`lag_envs.tasks.imperfections`)
-        that are on in this task's environments. On an instance: the checked values, or None. Formulas, and so
-        `envs.model.Model` and controllers, are those of the task without them.
+        that are on in this task's environments. On an instance, these are the checked values, or None.
+        Formulas, and therefore `envs.model.Model` and controllers, are those of the task without
+        imperfections.
     hyperparameters : mapping
-        Differences from `lag_envs.hyperparams.DEFAULTS`, by learner: one of `lag_envs.hyperparams.learners`,
-        or "off_policy", which stands for several. Settings in `policy_kwargs` are changed one by one.
+        Differences from `lag_envs.hyperparams.DEFAULTS`, by learner: a name from
+        `lag_envs.hyperparams.learners`, or "off_policy", which stands for several learners. Settings in
+        `policy_kwargs` are changed one by one.
     goal : record.Goal, optional
-        When the task is solved. Tasks of the package with a goal have a board.
+        When the task counts as solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
-        The grid on which ``python -m agents.optimum`` solves it.
+        The grid on which ``python -m agents.optimum`` solves the task.
     plans : record.Plans, optional
         How ``python -m agents.optimum`` finds the plan that ships with the package.
     optimum : record.Optimum, optional
@@ -118,9 +121,10 @@ class Task:
     difficulty : str
         Why the task is hard, in a sentence or two, for its page.
     note : str
-        A text about its agents for docs/agents.md, without numbers, which are in the tables.
+        A text about the task's agents for docs/agents.md. It contains no numbers, because these are in the
+        tables.
     quantities : mapping
-        For entries of the observation and for controls (unit, meaning), as the environment's page has them.
+        For entries of the observation and for controls: (unit, meaning), as shown on the environment's page.
 
     Parameters
     ----------
@@ -206,7 +210,8 @@ class Task:
             options = [*sorted(known), "dt", "duration", *target, *KEYWORDS, *OF_ENVIRONMENTS]
             close = hint(name, [*options, *OF_BATCHES], " ").strip()
             meant = "gym.make_vec makes many;" if name in OF_BATCHES else close
-            # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
+            # The message has Python's own words, by which libraries notice that an environment takes no
+            # `frameskip`.
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; {meant}{' ' if meant else ''}this environment "
                 f"takes {', '.join(options)}"
@@ -245,7 +250,7 @@ class Task:
     # --- what a task defines -------------------------------------------------------------------------------
 
     def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
-        """Return the controls to apply in place of the wanted ones, by name."""
+        """Return the controls to apply in place of the requested ones, by name."""
         return wanted
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -263,7 +268,7 @@ class Task:
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return the reward of the terminating step; by default, that of any other step.
 
-        It is scaled for another `dt` like `reward`, see `scaled`.
+        For another `dt`, it is scaled like `reward`; see `scaled`.
         """
         return self.reward(before, after, control, target, dt, xp)
 
@@ -280,19 +285,19 @@ class Task:
         return False
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return measures of `evaluation.rollout.Episodes` for docs/agents.md, besides the arrival."""
+        """Return measures of `evaluation.rollout.Episodes` for docs/agents.md, in addition to the arrival."""
         return {}
 
     def check(self) -> None:
         """Raise ValueError if the parameters do not fit the task."""
 
     def check_start(self, state: Any) -> None:
-        """Raise ValueError for an impossible start: by default, one at which the episode would be over.
+        """Raise ValueError for an impossible start: by default, a start at which the episode would be over.
 
         `state` is accessed by name or by index.
         """
         numbers, ended = np.array([*state]), False
-        # An ending that depends on the target is left to the first step.
+        # If the ending depends on the target, the first step decides.
         with contextlib.suppress(AttributeError, TypeError), np.errstate(all="ignore"):
             ended = bool(self.formulas.own().terminated(self.formulas.named_state([*numbers]), None, np))
         if ended:
@@ -301,7 +306,7 @@ class Task:
 
     @property
     def fastest(self) -> float:
-        """The largest speed that field and drive can give to a swing [rad/s]; 0 if nothing swings."""
+        """The largest speed that gravity and drive can give to a swing [rad/s]; 0 if nothing swings."""
         return 0.0
 
     @property
@@ -346,7 +351,7 @@ class Task:
         Returns
         -------
         pendulum.Coefficients, slope.FixedSlope or slope.TurningSlope
-            See `lag_envs.stepping.normal_forms`. In a formula they are those that the step uses.
+            See `lag_envs.stepping.normal_forms`. In a formula, these are the coefficients that the step uses.
         """
         recorded = self._recording
         form = form_of(self.scene) if recorded is None else recorded.form
@@ -355,7 +360,7 @@ class Task:
         k = SimpleNamespace(**motion_constants_of(self.scene)) if recorded is None else recorded.k
         return form.drive(list(state), list(control), k, xp)
 
-    #: While formulas are recorded, the recorded constants.
+    #: The recorded constants, while formulas are recorded.
     _recording: Any = None
 
     @property
@@ -376,7 +381,7 @@ class Task:
 
     @property
     def rest_action(self) -> Any:
-        """The action for zero control, or the nearest to it; applied if nobody presses a key."""
+        """The action whose control is zero, or nearest to zero; it is applied while no key is pressed."""
         return self.formulas.rest_action
 
     @property
@@ -387,7 +392,7 @@ class Task:
     def certified_speed(self) -> float | None:
         """Return the rate of the angle up to which one series per step is certified, whatever the control.
 
-        It is below 0 if one series is never enough, and None if the scene is not a driven pendulum. See
+        The rate is below 0 if one series is never enough, and None if the scene is not a driven pendulum. See
         `NormalForm.certified_speed`.
         """
         form: Any = form_of(self.scene)
@@ -398,7 +403,7 @@ class Task:
         return min((speed for speed in found if speed is not None), default=None)
 
     def chance(self, per_interval: float) -> float:
-        """Return an event's chance per step from that per interval: its rate is the same for any `dt`."""
+        """Return an event's chance per step from its chance per interval: the rate does not depend on `dt`."""
         if self._recording is not None:
             return self._recording.chance(per_interval)
         if self.dt == self.interval:
@@ -418,7 +423,7 @@ class Task:
 
     @cached_property
     def drawn(self) -> Drawn | None:
-        """The tasks from which each episode's task is drawn; None if no parameter is drawn."""
+        """The tasks from which each episode's task is drawn, or None if no parameter is drawn."""
         return Drawn(self) if self.imperfections and self.imperfections.drawn else None
 
     def varied(self, **parameters: float) -> Task:
@@ -437,14 +442,14 @@ class Task:
 
     @property
     def variant(self) -> tuple:
-        """What determines the code besides the class: the environments of a batch must agree in it."""
+        """What determines the code besides the class; the environments of a batch must agree in this."""
         scene, form = self.scene, form_of(self.scene)
         order = form.order(self.dt) if form else 0
         return *structure_of(scene)[1:3], scene.mechanics.zeros, order, self.fixed_target is None
 
     @property
     def target_range(self) -> Any:
-        """Half width of the random target, a tuple if there are several; None for a task without targets."""
+        """Half width of the random target: a tuple for several targets, None for a task without targets."""
         half = tuple(t.half for t in self.formulas.target_boxes)
         return half[0] if len(half) == 1 else half or None
 
@@ -487,7 +492,7 @@ class Task:
         return float(array[0]) if len(names) == 1 else array
 
     def effort(self, control: Any) -> NDArray[np.float64]:
-        """Return the mean square of the controls that actions set, as shares; for (n,) or (n, n_controls)."""
+        """Return the mean square of the controls (n,) or (n, n_controls) that actions set, as shares."""
         columns = [self.scene.control_names.index(a.control) for a in self.formulas.acting]
         shares = np.reshape(control, (len(control), -1))[:, columns] / np.atleast_1d(self.limit_control)
         return np.mean(shares**2, axis=1)
@@ -559,14 +564,14 @@ class Task:
 
 
 def check_task(what: str, task: Any) -> None:
-    """Raise a TypeError for what is no task, such as an id or an environment."""
+    """Raise a TypeError for a value that is not a task, such as an id or an environment."""
     if not isinstance(task, Task):
         raise TypeError(f"{what} takes a task, such as gym.make(ID).unwrapped.task, got {shown(task)}")
 
 
 @cache
 def _reserved() -> frozenset[str]:
-    """Return the keywords of environments, and of what makes them, that no field of a scene may have."""
+    """Return the names that no field of a scene may have: keywords of environments and of what makes them."""
     calls = (Task.__init__, gym.make, gym.make_vec)
     every = [p for call in calls for p in inspect.signature(call).parameters.values()]
     named = [p.name for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]

@@ -22,18 +22,19 @@ class Goal:
     text : str
         Success and time, in words.
     hold : float or None
-        The goal must hold without a break for this many seconds at the episode's end. None: it need not.
+        The goal must hold without a break for this many seconds at the episode's end. None: it need not hold.
     terminated : bool or None
-        Whether the episode must have terminated. None: it must not, and reaching the goal does not matter.
+        Whether the episode must have terminated. None: it must not have terminated, and reaching the goal
+        does not matter.
     arrival : str
-        Name of the event of reaching the goal, in a word or two. docs/agents.md reports its time and the
-        reward lost until then; with an empty string it does not.
+        Name of the event of reaching the goal, in a word or two. docs/agents.md reports the time of this
+        event and the reward lost until then, unless the string is empty.
     rules : int
         Version of the board's rules: 2 adds imperfect sensors and actuators, and hidden parameters, to its
         disturbances. A board keeps the version that it began with.
     counted : bool
-        Whether the board shows how many episodes succeed. False if its protocol began with a rule for success
-        that cannot hold: the rule stays until the next protocol.
+        Whether the board shows how many episodes succeed. This is False if the protocol began with a rule for
+        success that cannot hold; the rule stays until the next protocol.
     """
 
     text: str
@@ -51,7 +52,7 @@ class Controller:
     Parameters
     ----------
     place : str
-        Function that makes it from the task, "module:function".
+        Function that makes the controller from the task, "module:function".
     numbers : mapping
         Its keyword arguments.
     tune : mapping
@@ -59,7 +60,7 @@ class Controller:
     plans : bool
         Whether it plans for some seconds before each episode.
     real_time : mapping, optional
-        For one whose planning takes longer than a step: the numbers with which it acts in real time.
+        For a controller whose planning takes longer than a step: the numbers with which it acts in real time.
     """
 
     place: str
@@ -101,7 +102,7 @@ class Plans:
         Parameters of the scene that differ in the model of the feedback: dry friction is so steep at rest
         that its linearisation misleads.
     of : str
-        Id of the task whose recorded plans are followed; empty: its own.
+        Id of the task whose recorded plans are followed. Empty: the task's own plans.
     """
 
     place: str
@@ -127,11 +128,11 @@ class Open:
     controller : str
         Name of the controller of the task that is the reference.
     options : mapping
-        Keywords of the environment in which it plays, which give it the privileged knowledge.
+        Keywords of the environment in which this controller acts; they give it the privileged knowledge.
     knows : str
         The privileged knowledge, in words.
     tried : mapping of str to str
-        The attempts: methods, and the budget of each.
+        The methods that were tried, and the budget of each.
     """
 
     controller: str
@@ -165,9 +166,9 @@ class Axis:
     label : str
         Name with unit, for figures.
     low, high : float
-        The range. A state outside gets the value of the nearest one on the edge.
+        The range. A state outside gets the value of the nearest state on the edge.
     cells : int
-        Cells at level 1, even; twice as many at level 2.
+        Number of cells at level 1, an even number; level 2 has twice as many.
     scale : float, optional
         Within this distance of the centre the nodes are evenly spaced; farther out the spacing grows. None:
         evenly spaced everywhere.
@@ -201,13 +202,15 @@ class ValueIteration:
         Parameters of an easier task that is solved in place of this one, a relaxation. There is no policy
         then.
     keep : tuple of int
-        Indices of the state's entries that are on the grid; the others are 0 there. Empty: all.
+        Indices of the state's entries that are axes of the grid; the other entries are 0 on the grid. Empty:
+        all.
     targets : tuple of float
-        Targets, from 0 on, to solve for. Others are interpolated, negative ones mirrored. Empty: none.
+        Targets to solve for, from 0 upwards. Other targets are interpolated, and negative ones mirrored.
+        Empty: no target.
     pushes : int
         Number of kick sizes in the expectation: midpoints of as many parts of a kick's second random number.
     chance : float
-        Chance of a kick per interval: there is one if its first random number is below.
+        Chance of a kick per interval: a kick happens if its first random number is below this.
     actions : int
         Number of actions, evenly spaced between the extremes.
     most : float
@@ -219,8 +222,8 @@ class ValueIteration:
     mirror : str
         Entry of the state, or ``"target"``, by whose sign the submitted table is mirrored. Empty: none.
     relaxed : str
-        Id of the task whose solution bounds this one from above, in place of a grid of its own. It is
-        looked up at the entries `keep` of the state.
+        Id of the task whose solution bounds this one from above, in place of a grid of its own. That solution
+        is looked up at the entries `keep` of the state.
     """
 
     axes: tuple[Axis, ...] = ()
@@ -256,9 +259,9 @@ class Examples:
     rest : sequence of float, optional
         A state of rest, with the action 0.
     batch : mapping
-        Parameters, one for each environment of a batch, mild and extreme ones.
+        Parameters with a value for each environment of a batch, mild and extreme values.
     variants : mapping
-        By name, keywords of the environment that change more than numbers.
+        Named sets of keywords of the environment that change more than numbers.
     """
 
     start: Mapping[str, Any] = field(default_factory=dict)

@@ -63,7 +63,7 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
 def make_task(env_id: str, **options: Any) -> Any:
     """Return the task of a registered environment, with some of its parameters changed.
 
-    As with `gym.make`, "module:Id-v0" imports the module first.
+    As with `gym.make`, an id of the form "module:Id-v0" imports the module first.
     """
     if ":" in env_id:
         module, _, env_id = env_id.partition(":")
@@ -76,8 +76,8 @@ def _place(task: type[Any]) -> str | type[Any]:
     """Return "module:Class" if that leads to the class, else the class."""
     found: Any = sys.modules.get(task.__module__)
     if task.__module__ == "__main__" and not hasattr(found, "__file__"):
-        return task  # a notebook or a prompt: another process would not find it
+        return task  # from a notebook or a prompt, where another process would not find it
     for part in task.__qualname__.split("."):
         found = getattr(found, part, None)
-    # While its module runs, a class that is registered by a decorator is not defined in it yet.
+    # A class that a decorator registers is not yet defined in its module while the module runs.
     return f"{task.__module__}:{task.__qualname__}" if found is task else task

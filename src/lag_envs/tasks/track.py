@@ -36,13 +36,13 @@ class GuardedTrack(Support):
     """
 
     def check(self) -> None:
-        """Record whether the support's place is part of the task, and whether its track ends."""
+        """Store whether the support's place is part of the task, and whether its track ends."""
         self.has_track = self.scene.track is not None
         self.ends = self.has_track and math.isfinite(self.scene.track)
 
     @property
     def variant(self) -> tuple:
-        """Add whether there is an end of the track to guard."""
+        """Add whether the track has an end to guard."""
         return *super().variant, self.ends
 
     @property
@@ -59,7 +59,8 @@ class GuardedTrack(Support):
         if not self.ends:
             return wanted
         # With v the speed at the step's end, and braking from there at U, the support stops at
-        # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U: it passes S or -S if v² + |reach| > 2US.
+        # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, this says that the support passes S or -S if v² +
+        # |reach| > 2US.
         s, s_dot, push = before.s, before.s_dot, wanted.s_ddot
         top, per_step = self.largest, self.largest * dt
         ends, start = 2.0 * (top * self.length), (2.0 * top) * s + per_step * s_dot
@@ -73,7 +74,7 @@ class GuardedTrack(Support):
         return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * push, hardest), push)
 
     def observe_support(self, after: Any) -> dict[str, Any]:
-        """Return s/S, s'/2; nothing without a track."""
+        """Return s/S and s'/2, or nothing without a track."""
         return {"s/S": after.s * (1.0 / self.length), "s_dot/2": 0.5 * after.s_dot} if self.has_track else {}
 
     def bounds_of_support(self) -> dict[str, float]:

@@ -10,7 +10,7 @@ from lag_envs.scenes.fitting.shooting import Shooting
 
 Array = NDArray[np.float64]
 
-#: Derivatives with a singular value below this, at unit length, count as dependent.
+#: Derivatives, scaled to unit length, count as dependent if they have a singular value below this.
 DEPENDENT = 1e-7
 #: A parameter has no effect if doubling it, or adding one unit, moves no state by more than this part of its
 #: range.
@@ -61,7 +61,7 @@ class Determined:
         lengths = np.linalg.norm(by_starts, axis=0)
         starts = orth(by_starts / np.where(lengths > 0.0, lengths, 1.0), rcond=1e-10)
         rest = by_parameters - starts @ (starts.T @ by_parameters)
-        rest -= starts @ (starts.T @ rest)  # once more, to remove rounding errors
+        rest -= starts @ (starts.T @ rest)  # projected once more, to remove rounding errors
         left = np.linalg.norm(rest, axis=0)
         none = np.abs(moved[of >= 0]).max(axis=0) < NO_EFFECT
         none |= left <= DEPENDENT * np.linalg.norm(by_parameters, axis=0)
@@ -105,9 +105,9 @@ class Determined:
             far_off = (
                 f"such values may mean that nothing moved, or that {SUSPECTS} is wrong"
                 if self._astray
-                else "if that is far off, begin closer to the truth"
+                else "if these values are far off, begin closer to the truth"
             )
             raise ValueError(
                 f"the data do not determine {'; nor '.join(texts)}. {remedy} recordings in which {it} {has} "
-                f"an effect, such as some under known controls. The search ended at {ended}; {far_off}"
+                f"an effect, such as recordings under known controls. The search ended at {ended}; {far_off}"
             )

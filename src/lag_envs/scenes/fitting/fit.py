@@ -34,15 +34,17 @@ Array = NDArray[np.float64]
 
 #: Lengths of pieces [measured samples] in the first searches, which start from the smoothed data.
 SHORT = (3, 10)
-#: The most unknowns for starts, unless there are more recordings: the time of a step grows as their square.
+#: The largest number of unknowns for starts, unless there are more recordings: the time of a step grows as
+#: its square.
 MOST_STARTS = 200
-#: Gaps between pieces may first be as large as the noise, then only these parts of it; finally none remain.
+#: Gaps between pieces may first be as large as the noise, then only these parts of the noise; finally no gaps
+#: remain.
 CLOSING = (0.03, 1e-3)
 #: Relative changes of sum of squares and unknowns at which intermediate searches and the last one end.
 COARSE, FINE = 1e-4, 1e-12
 #: Noise is at least this part of a state's range, to allow for rounding and for errors of simulated data.
 LEAST_NOISE = 1e-9
-#: A range below this, or below the part above of the values, is rounding: nothing moves.
+#: A range below this, or below the above part of the values, is taken for rounding: nothing moves.
 LEAST_RANGE = 1e-12
 #: A standard error above this part of the estimate, or a correlation above this, causes a warning.
 WIDE, CORRELATED = 0.5, 0.999
@@ -51,7 +53,7 @@ MISFIT, INVISIBLE = 2.0, 1e-6
 #: A residual this many times the spread of its state's residuals (that of a normal distribution with the same
 #: median of sizes) is an outlier, if there are at least so many.
 OUTLYING, LEAST_COUNT = 6.0, 20
-#: How often the noise is estimated, and the fit repeated with it, at most.
+#: How many times at most the noise is estimated and the fit repeated with the estimate.
 WEIGHINGS = 8
 
 
@@ -102,12 +104,12 @@ def fit(
 
 
 class _Sizes:
-    """How large residuals, gaps and the motion are, by state.
+    """The sizes of residuals, of gaps and of the motion, by state.
 
     Attributes
     ----------
     range : ndarray, shape (n_state,)
-        Largest minus smallest value; if not measured, that of the guess.
+        Largest minus smallest value; for a state that was not measured, that of the guess.
     noise : ndarray, shape (n_state,)
         Standard deviation of the residuals.
     given : bool
@@ -149,7 +151,7 @@ class _Sizes:
 
     @property
     def gap(self) -> Array:
-        """Noise of measured states; for the others the same part of their range."""
+        """Noise of measured states; for the others, the same part of their range."""
         part = np.median((self.noise / self.range)[self.seen])
         return np.where(self.seen, self.noise, part * self.range)
 
@@ -288,12 +290,13 @@ def _doubts_of_parameters(
     for i, (name, value) in enumerate(fitted.estimates.items()):
         wide = fitted.errors[name] > WIDE * abs(value)
         end = min(parameters.low[i], parameters.high[i], key=lambda end: abs(best[i] - end))
-        # With an error wide enough, every value is near the end: then nearly all of the way there counts.
+        # With a wide enough error every value is near the end; then only one that is nearly at the end
+        # counts.
         reach = min(errors[i], abs(parameters.start[i] - end)) if wide else errors[i]
         if wide and not converged and grown[i]:
             texts.append(_endless(f"{name}={value:.3g}"))
         elif abs(best[i] - end) < 0.01 * reach:
-            texts.append(f"{name}={value:.3g} lies at the end of its range: its interval is too short")
+            texts.append(f"{name}={value:.3g} lies at the end of its range, so its interval is too short")
         elif wide:
             texts.append(
                 f"the data hardly determine {name}: {value:.3g} with a standard error of "
@@ -303,7 +306,7 @@ def _doubts_of_parameters(
             if abs(fitted.correlation[i, j]) > CORRELATED:
                 texts.append(
                     f"{names[j]} and {name} can hardly be told apart: their correlation is "
-                    f"{fitted.correlation[i, j]:.5f}; hold one of them, or add other recordings"
+                    f"{fitted.correlation[i, j]:.5f}; leave one of them out of free, or add other recordings"
                 )
     return texts
 
@@ -323,7 +326,8 @@ def _doubt_of_motion(fitted: Fit, sizes: _Sizes) -> list[str]:
     if strength >= 2.0 * math.log(sizes.count) + 10.0:
         return []
     return [
-        "the motion hardly stands out of the noise, which the estimates may follow: measure a larger motion"
+        "the motion hardly stands out of the noise, so the estimates may follow the noise: measure a larger "
+        "motion"
     ]
 
 
@@ -341,15 +345,15 @@ def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
             there = "where the noise was given as" if sizes.given else "where short pieces of it are off by"
             texts.append(
                 f"the model does not follow {name}: it is off by {size:.2g} {unit}, {there} "
-                f"{least:.2g} {unit}; something that is held may be wrong, or a force is not modelled"
+                f"{least:.2g} {unit}; a fixed parameter may be wrong, or a force is missing in the energies"
             )
         pairs = np.concatenate([c[1:] * c[:-1] for c in columns])
         pairs = pairs[np.isfinite(pairs)]
         likeness = pairs.mean() / np.mean(known**2) if len(pairs) else 0.0
         if abs(likeness) > 4.0 / math.sqrt(max(len(pairs), 1)):
             texts.append(
-                f"the residuals of {name} are not independent: from sample to sample their correlation is "
-                f"{likeness:.2f}, so the intervals are too short; look at them with plot()"
+                f"the residuals of {name} are not independent: their correlation from sample to sample is "
+                f"{likeness:.2f}, so the intervals are too short; look at the residuals with plot()"
             )
     return texts
 
@@ -370,14 +374,14 @@ def _misread(fitted: Fit, sizes: _Sizes) -> list[str]:
         texts.append(
             f"{count} value{'s' * (count > 1)} of {name} may be misread: off by more than {far:.2g} {unit}, "
             f"{OUTLYING:g} times the spread of the others; the largest, {absolute[which][row]:.2g} {unit}, "
-            f"at {row * fitted.recordings[which].dt:.4g} s{where}. If so, give NaN there; with them, "
-            "estimates and intervals do not hold"
+            f"at {row * fitted.recordings[which].dt:.4g} s{where}. If so, give NaN there; with misread "
+            "values, estimates and intervals do not hold"
         )
     return texts
 
 
 def _visible(fitted: Fit, sizes: _Sizes) -> Iterator[tuple[int, list[Array], Array]]:
-    """Yield each measured state whose residuals matter, with them: by recording, and all finite ones."""
+    """Yield each measured state whose residuals matter, its residuals by recording, and all finite ones."""
     for i in np.flatnonzero(sizes.seen).tolist():
         columns = [residual[:, i] for residual in fitted.residuals]
         known = np.concatenate([c[np.isfinite(c)] for c in columns])

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Starting value of a parameter that is 0: at 0 its terms would be left out of the motion.
+#: Starting value of a parameter that is 0: at 0 the motion would have no terms with this parameter.
 NEARLY_ZERO = 1e-6
-#: A parameter at this many times its first value, or at this many units if that is 0, may have run away.
+#: A parameter may have run away at this many times its first value, or at this many units if that value is 0.
 ENDLESS = 1e3
 
 
@@ -57,8 +57,8 @@ class FreeParameters:
             return np.where(self.logs, np.log(values), values)
 
     def values(self, scaled: Array) -> Array:
-        """Return the values of scaled ones."""
-        with np.errstate(over="ignore"):  # the interval of what the data hardly determine ends at infinity
+        """Return the values of scaled parameters."""
+        with np.errstate(over="ignore"):  # the interval of a poorly determined parameter ends at infinity
             return np.where(self.logs, np.exp(np.where(self.logs, scaled, 0.0)), scaled)
 
     def slopes(self, scaled: Array) -> Array:
@@ -84,7 +84,7 @@ class FreeParameters:
         Returns
         -------
         names : list of str
-            The free ones, and those that follow.
+            The free parameters, and those that follow them.
         derivatives : ndarray, shape (number of names, p)
             Those of followers are finite differences: a default may be any function of the scene.
         """

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: At most, for angles whose rates alone were measured: starts that are tried for each, those tried for all of
-#: them together, and samples compared.
+#: Largest numbers for angles of which only the rates were measured: starts that are tried for each angle,
+#: starts that are tried for all of them together, and samples that are compared.
 TRIED, MOST_TRIED, COMPARED = 16, 4096, 64
 #: An angle may be in degrees if it spans more turns, or moves over half a turn in more than this part of
 #: its steps.
 MANY_TURNS, OFTEN = 100.0, 0.1
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
-#: A step of more substeps than this is long: those of well-sampled motions need a few.
+#: A step of more substeps than this is long: the steps of well-sampled motions need a few.
 LONG = 40
 
 
@@ -60,10 +60,12 @@ def recordings_of(scene: Scene, given: Any) -> list[Recording]:
     """Return the recordings, checked, angles unwrapped; raise a ValueError that names what is wrong."""
     if not isinstance(given, Sequence) or isinstance(given, str) or not given:
         raise ValueError(
-            f"recordings must be a list of (states, controls, dt), at least one, got {_kind(given)}"
+            f"recordings must be a list of at least one (states, controls, dt), got {_kind(given)}"
         )
     if isinstance(given[-1], numbers.Real):
-        raise ValueError("recordings must be a list of (states, controls, dt), got one; put it into a list")
+        raise ValueError(
+            "recordings must be a list of (states, controls, dt), got a single recording; put it into a list"
+        )
     found = []
     for i, one in enumerate(given):
         if not isinstance(one, tuple | list) or len(one) != 3:
@@ -78,14 +80,14 @@ def recordings_of(scene: Scene, given: Any) -> list[Recording]:
 def _recording(scene: Scene, states: Any, controls: Any, dt: Any) -> Recording:
     if np.ndim(dt):
         raise ValueError(
-            "dt must be one number [s]; where the times are not evenly spaced, put the samples on a finer "
-            "even grid and NaN between them"
+            "dt must be one number [s]; if the times are not evenly spaced, put the samples on a finer even "
+            "grid, with NaN between them"
         )
     names, array = scene.state_names, _numbers(states)
     if array.ndim != 2 or array.shape[1] != len(names):
         raise ValueError(
-            f"states must have shape (N, {len(names)}), in each row {', '.join(names)} with NaN for what was "
-            f"not measured, got {array.shape}"
+            f"states must have shape (N, {len(names)}), with {', '.join(names)} in each row and NaN for "
+            f"values that were not measured, got {array.shape}"
         )
     if np.isinf(array).any():
         raise ValueError(
@@ -114,7 +116,7 @@ def _numbers(states: Any) -> Array:
 
 
 def _kind(value: Any) -> str:
-    """Return what a value is, for a message; data would say nothing."""
+    """Return what a value is, for a message; its data would not help."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
     name = f"a {type(value).__name__}"
@@ -126,14 +128,14 @@ def _controls(scene: Scene, controls: Any, count: int) -> Array:
     steps, n = count - 1, len(scene.control_names)
     if controls is None:
         return np.zeros((steps, n))
-    if n:  # what was sampled together with the last state acts only after it, and need not be finite
+    if n:  # controls sampled together with the last state act only after it, and need not be finite
         array = real_array("controls", controls)
         controls = array[:steps] if array.shape[:1] == (count,) else array
     given = check_sequence(scene, controls)
     if len(given) not in ((steps,) if n else (steps, count)):
         raise ValueError(
-            f"{count} states need controls for the {steps} steps between them, or one for each state, of "
-            f"which the last is not used; got {len(given)}"
+            f"{count} states need controls for the {steps} steps between them, or controls for each state, "
+            f"of which the last are not used; got {len(given)}"
         )
     return given[:steps]
 
@@ -168,13 +170,13 @@ def doubtful_units(scene: Scene, data: Sequence[Recording]) -> list[str]:
 
 
 def doubtful_interval(scene: Scene, data: Sequence[Recording], guesses: Sequence[Array]) -> list[str]:
-    """Return a warning if the steps of a recording need many substeps: the interval may not be in seconds."""
+    """Return a warning if steps need many substeps, since the interval may not be in seconds."""
     counts = []
     for recording, states in zip(data, guesses, strict=True):
         at = len(recording.controls) // 2
         with contextlib.suppress(StepRefused):
             counts.append(scene.step_bound(states[at], recording.controls[at], recording.dt).substeps)
-    if len(counts) < len(data) or not LONG < max(counts) <= MAX_SUBSTEPS:  # beyond, steps are refused
+    if len(counts) < len(data) or not LONG < max(counts) <= MAX_SUBSTEPS:  # beyond this, steps are refused
         return []
     i = int(np.argmax(counts))
     return [
@@ -225,7 +227,7 @@ def _turns(
 ) -> Array:
     """Return by how much to turn entries so that accelerations are most like the slopes of their rates.
 
-    They are compared up to a factor, since the parameters are still wrong.
+    Accelerations and slopes are compared up to a factor, since the parameters are still wrong.
     """
     count = min(TRIED, int(MOST_TRIED ** (1.0 / len(turned))))
     angles = np.indices((count,) * len(turned)).reshape(len(turned), -1).T * (2.0 * np.pi / count)

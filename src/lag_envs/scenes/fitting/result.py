@@ -35,9 +35,10 @@ class Fit:
     errors : dict of str to float
         Their standard errors.
     intervals : dict of str to (float, float)
-        Their confidence intervals. Those of a parameter that must be above 0 are symmetric in its logarithm.
+        Their confidence intervals. The interval of a parameter that must be above 0 is symmetric in its
+        logarithm.
     level : float
-        Their level.
+        The level of the intervals.
     correlation : ndarray, shape (p, p)
         Correlations of the estimates, in the order of `estimates`.
     noise : dict of str to float
@@ -47,7 +48,7 @@ class Fit:
     simulated : list of ndarray, shape (N, n_state)
         The fitted motion of each recording; its first row is the estimated start.
     warnings : tuple of str
-        The warnings given.
+        The texts of the warnings.
     """
 
     scene: Scene
@@ -71,7 +72,7 @@ class Fit:
         rows = [("parameter", "estimate", "std. error", f"{100 * self.level:g} % interval", "unit")]
         for name, value in self.estimates.items():
             error = self.errors[name]
-            # As many digits as the error, which has two significant digits.
+            # The value is rounded like the error, which has two significant digits.
             digits = max(
                 2, 2 + math.floor(math.log10(max(abs(value), error))) - math.floor(math.log10(error))
             )

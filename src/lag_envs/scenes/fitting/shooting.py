@@ -1,9 +1,9 @@
-"""Multiple shooting: a recording is cut into pieces, each simulated from a start of its own.
+"""Multiple shooting: a recording is cut into pieces, and each piece is simulated from its own start.
 
 The unknowns are the free parameters and the pieces' starts. The residuals are the differences between
 measurements and simulation, and the gaps between the end of each piece and the start of the next, all divided
-by their expected sizes. Pieces make it robust: a motion of a few steps is never far off, whatever the
-parameters are.
+by their expected sizes. The pieces make the search robust: a motion of a few steps is never far off, whatever
+the parameters are.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 #: The largest factor by which one search may change a parameter that is sought by its logarithm: parameters
 #: that short pieces do not determine must not run away.
 FARTHEST = np.log(1e3)
-#: The most evaluations of a search; nearly all that find the data take less than a tenth of them.
+#: The largest number of evaluations of a search; nearly all searches that succeed take less than a tenth of
+#: it.
 LONGEST = 500
 
 
@@ -137,7 +138,8 @@ class Shooting:
     def sensitivities(self, z: Array) -> list[Array]:
         """Return the derivatives of each piece's motion, shape (steps + 1, n_state, n_state + p).
 
-        First come those with respect to its start, then those with respect to the scaled parameters.
+        The derivatives with respect to its start come first, then those with respect to the scaled
+        parameters.
         """
         scene, motions = self.simulate(z)
         p, n = len(self.parameters.names), len(self.noise)
@@ -177,7 +179,7 @@ class Shooting:
         return found
 
     def solve(self, z: Array, tolerance: float, *, starts: bool = True) -> Any:
-        """Return SciPy's result of a minimisation that begins at z; unless `starts`, starts are held."""
+        """Return SciPy's result of a minimisation from z on; starts are held unless `starts` is true."""
         from scipy.optimize import least_squares
 
         p, parameters = len(self.parameters.names), self.parameters
