@@ -207,7 +207,7 @@ def test_bad_input():
         on_processor(BAR, 2).reset(options={"reset_mask": torch.tensor([True, False])})
     imperfect = next(id for id, kind in TASKS.items() if kind.imperfections)
     for make, message in (
-        (lambda: on_processor(imperfect, 2), f"{imperfect} cannot be on a GPU: .* take the id without them"),
+        (lambda: on_processor(imperfect, 2), f"{imperfect} cannot be on a GPU: .* take an id without them"),
         (lambda: on_processor(BAR.id, 2, action_delay=0.02), "leave these keywords out"),
         (lambda: on_processor(BAR, 2, damping=[0.0, 0.1]), "give damping one value"),
         (lambda: on_processor("Pendulum-v1", 2), "not an environment of this package"),
@@ -348,7 +348,7 @@ def _on_any(task, num_envs, device, dtype, **options):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu(capsys):
-    with pytest.raises(ValueError, match=r"there is no device 'cuda' here: .* or leave device out"):
+    with pytest.raises(ValueError, match=r"this machine has no device 'cuda': .* or leave device out"):
         TorchVectorEnv(BAR.id, 2, device="cuda")
     for device in ("meta", "gpu", torch.device("mps")):
         with pytest.raises(ValueError, match=f"device must be 'cpu' or 'cuda', got '{device}'"):
@@ -358,7 +358,7 @@ def test_without_a_gpu(capsys):
     with pytest.raises(ValueError, match=r"on the CPU dtype must be torch\.float64, got torch\.float32"):
         TorchVectorEnv(BAR.id, 2, dtype=torch.float32)
     for given, message in (
-        (["--device", "cuda"], "--device: there is no device 'cuda' here"),
+        (["--device", "cuda"], "--device: this machine has no device 'cuda'"),
         (["--device", "cpu"], "--device must be cuda or cuda:N, got 'cpu'; leave it out for the processor"),
         (["--device", "cuda:x"], "--device: device must be 'cpu' or 'cuda', got 'cuda:x'"),
         (["--device", "cuda", "--cold"], "--device cannot be combined with --cold"),

@@ -26,7 +26,7 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
 
 Tensor = torch.Tensor
-#: Starts a kernel: its name, number of environments, arguments.
+#: Starts a kernel, given its name, the number of environments and the arguments.
 Launch = Callable[..., None]
 Load = Callable[[str, torch.device, bool], Launch]
 #: Practically no limit of steps.
@@ -34,7 +34,7 @@ ENDLESS = 2**62
 
 
 def made_vector(task: str | type[Task], num_envs: int, cannot: str, **options: Any) -> LagrangianVectorEnv:
-    """Return the vector environment of an id or a task; for one of another package raise a ValueError."""
+    """Return the vector environment of an id or a task; raise a ValueError for one of another package."""
     if not isinstance(task, str):
         return LagrangianVectorEnv(task, num_envs, **options)
     made = gym.make_vec(task, num_envs, **options).unwrapped
@@ -56,7 +56,7 @@ class DeviceEnvs:
     Attributes
     ----------
     rows : Tensor, shape (n_rows, num_envs)
-        The numbers kept of the environments, including states, targets and controls.
+        The numbers that are kept for the environments, including states, targets and controls.
     ages : Tensor of int32, shape (num_envs,)
         Steps taken in the present episodes; negative where an episode is over.
 
@@ -85,16 +85,18 @@ class DeviceEnvs:
             if option not in KEYWORDS and isinstance(value, list | tuple | np.ndarray):
                 raise ValueError(
                     f"on a GPU all environments have the same parameters: give {option} one value, "
-                    "or make one TorchVectorEnv for each"
+                    "or make one TorchVectorEnv for each value"
                 )
         #: One environment on the CPU, which provides task, spaces and modes.
         self.sample = sample = made_vector(task, 1, "cannot be on a GPU", **options)
         if sample.render_mode or sample.diagnostics:
-            raise ValueError("a GPU has neither render_mode nor diagnostics; leave them out")
+            raise ValueError(
+                "environments on a GPU have neither render_mode nor diagnostics; leave these keywords out"
+            )
         if sample.task.imperfections:
             raise ValueError(
                 f"{name} cannot be on a GPU: it has imperfect sensors, imperfect actuators or hidden "
-                "parameters; leave these keywords out, take the id without them, or device='cpu'"
+                "parameters; leave these keywords out, take an id without them, or use device='cpu'"
             )
         self.task = sample.task
         kernels = kernels_of(self.task, dtype == torch.float32)
@@ -249,12 +251,12 @@ def checked_device(device: str | torch.device) -> torch.device:
     found = torch.device(device)
     if torch.version.cuda is None or not torch.cuda.is_available():
         why = (
-            "this PyTorch has been built without CUDA. Install one that has it, see pytorch.org,"
+            "this PyTorch has been built without CUDA. Install a build with CUDA (see pytorch.org),"
             if torch.version.cuda is None
-            else "PyTorch sees no GPU. Look with nvidia-smi whether there is one, and a driver for it,"
+            else "PyTorch sees no GPU. Use nvidia-smi to check for a GPU and its driver,"
         )
-        raise ValueError(f"there is no device {str(device)!r} here: {why} or leave device out")
+        raise ValueError(f"this machine has no device {str(device)!r}: {why} or leave device out")
     number = torch.cuda.current_device() if found.index is None else found.index
     if number >= (count := torch.cuda.device_count()):
-        raise ValueError(f"there is no device {str(device)!r} here: the last one is cuda:{count - 1}")
+        raise ValueError(f"this machine has no device {str(device)!r}: the last GPU is cuda:{count - 1}")
     return torch.device("cuda", number)

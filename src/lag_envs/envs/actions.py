@@ -44,7 +44,7 @@ class Actions:
         self.shape = () if len(values) == 1 else (count,)
 
     def one(self, action: Any) -> Any:
-        """Return an action as a float, or as an array where it has several numbers; or raise a ValueError."""
+        """Return an action as a float, or as an array if it has several numbers; or raise a ValueError."""
         array = self._array(action, "the action", self.shape)
         if self.values:
             self._check_choices(array, "the action")
@@ -86,7 +86,7 @@ class Actions:
 
 
 def single_number(values: NDArray[np.float64]) -> Any:
-    """Return a copy of an array, or its number if the last axis has only one."""
+    """Return a copy of an array, or its only number if the last axis has length 1."""
     if values.shape[-1] != 1:
         return values.copy()
     return float(values[0]) if values.ndim == 1 else values[..., 0].copy()

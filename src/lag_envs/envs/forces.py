@@ -1,7 +1,8 @@
 """Arrows for controls, and for the forces that a scene names.
 
-Each is a generalised force along a coordinate. The poses determine its point of application and direction: it
-pushes the first body that the coordinate moves, in the direction in which the coordinate moves it.
+Each arrow is a generalised force along a coordinate. The poses determine where the force acts and its
+direction: it pushes the first body that the coordinate moves, in the direction in which the coordinate moves
+this body.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from lag_envs.scenes.shapes import Arrow, Frame, Point, arc
 from lag_envs.tasks.base import Task
 
 #: Length of the arrow of the largest control, or of a force of usual size, as a share of the window; and the
-#: longest arrow, in these lengths.
+#: length of the longest arrow, as a multiple of this.
 LONG, MOST = 0.22, 1.6
-#: How far coordinates are moved to see which bodies move along.
+#: How far coordinates are moved to find out which bodies move with them.
 STEP = 1e-6
 
 
@@ -33,7 +34,7 @@ class Forces:
     task : Task
         The task.
     picture : Picture
-        Its picture; if this has arrows for the controls already, no others are drawn.
+        Its picture; if the picture already has arrows for the controls, no other control arrows are drawn.
     """
 
     def __init__(self, task: Task, picture: Picture) -> None:
@@ -114,7 +115,7 @@ class Forces:
         return given(1.0) - given(0.0) - (drag[0] - drag[1])
 
     def _arrow(self, coordinate: str, share: float, q: Mapping[str, float]) -> Iterator[Arrow]:
-        """Yield the arrow of a force along a coordinate, if this moves anything visible."""
+        """Yield the arrow of a force along a coordinate, if the coordinate moves anything visible."""
         share = max(-MOST, min(MOST, share))
         if not math.isfinite(share) or abs(share) < 0.02:
             return

@@ -62,7 +62,7 @@ def still(
 ) -> NDArray[np.uint8] | None:
     """Return a picture of a state, by default the middle of the starts; None if there is nothing to draw.
 
-    With `columns`, its size allows for this many pictures side by side.
+    With `columns`, the size of the picture leaves room for this many pictures side by side.
     """
     from lag_envs.envs.rendering import paint, tile_size
     from lag_envs.scenes.shapes import Frame

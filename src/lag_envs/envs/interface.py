@@ -40,7 +40,7 @@ class TaskEnv:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How it was made. Its step limit is the one that the environment itself enforces."""
+        """How the environment was made; its step limit is the one that the environment itself enforces."""
         return self._spec
 
     @spec.setter
@@ -57,8 +57,9 @@ class TaskEnv:
 def true_spec(spec: EnvSpec, limit: float) -> EnvSpec:
     """Return a copy of a spec with the number of steps of an episode, in a form that can be written as JSON.
 
-    Gymnasium omits the number if the environment itself ends an episode. From a spec that contains it,
-    Gymnasium adds a `TimeLimit` of as many steps, which then agrees with the environment's own.
+    Gymnasium omits the number if the environment itself ends an episode. From a spec that contains the
+    number, Gymnasium adds a `TimeLimit` with the same number of steps, which then agrees with the
+    environment's own limit.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ def check_look(arrows: Any, trail: Any, readout: Any) -> tuple[bool, float, bool
 
 
 def check_flag(name: str, value: Any) -> None:
-    """Raise ValueError for anything but a bool: any string would count as true."""
+    """Raise ValueError for anything but a bool, since any string would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
 

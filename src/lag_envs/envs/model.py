@@ -31,9 +31,9 @@ class Expansion(NamedTuple):
     Attributes
     ----------
     slopes : ndarray, shape (n, n_state, m)
-        Of the state after the step.
+        Derivatives of the state after the step.
     gradient : ndarray, shape (n, m)
-        Of the reward.
+        Derivatives of the reward.
     curvature : ndarray, shape (n, m, m)
         Second derivatives of the reward, without the contribution of the motion's second derivatives.
     """
@@ -55,7 +55,7 @@ class Gradient(NamedTuple):
     targets : ndarray, shape (n, n_targets)
         With respect to the targets.
     parameters : ndarray, shape (n, n_parameters)
-        With respect to the named parameters of the scene, row by row.
+        With respect to the named parameters of the scene, separately for each row.
     """
 
     states: Array
@@ -67,8 +67,9 @@ class Gradient(NamedTuple):
 class Model:
     """One step as a function: control, motion, reward and ending, from the environments' own formulas.
 
-    It agrees with the environment's step to rounding, not bit for bit: an environment carries cosθ and sinθ
-    along, the model computes them from θ. It applies no random kicks; use `kicked` for these.
+    It agrees with the environment's step to rounding, not bit for bit, because an environment carries cosθ
+    and sinθ along whereas the model computes them from θ. The model applies no random kicks; use `kicked` for
+    these.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ class Model:
         self._reversed: dict[tuple[str, ...], Reverse] = {}
 
     def __reduce__(self) -> tuple[type[Model], tuple[Task]]:
-        return Model, (self.task,)  # what is compiled is made again
+        return Model, (self.task,)  # compiled functions are made again
 
     def __call__(
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None
@@ -107,12 +108,12 @@ class Model:
         Parameters
         ----------
         states : array_like, shape (n, n_state)
-            States in the order of ``task.scene.state_names``; whether an episode would have ended there does
-            not matter.
+            States in the order of ``task.scene.state_names``. It does not matter whether an episode would
+            have ended in these states.
         actions : array_like, shape (n,), or (n, n_actions) where there are several
             Actions; finite values outside their space are clipped.
         targets : array_like, shape (n,) or (), or (n, n_targets) or (n_targets,) where there are several
-            Targets, for a task that has them and does not fix them.
+            Targets, for a task whose targets are random.
 
         Returns
         -------
@@ -208,7 +209,7 @@ class Model:
         """Pull a gradient back through a step (vector-Jacobian product).
 
         This is reverse mode through clipping, guard, motion, reward and observation. docs/derivatives.md
-        explains its meaning at kinks and ends.
+        explains what the gradient means at kinks and at the ends of episodes.
 
         Parameters
         ----------
@@ -225,7 +226,7 @@ class Model:
         ends : array_like, shape (n, n_state), optional
             The states after the step, before kicks, if known.
         kicks : array_like, shape (n, n_state)
-            What kicks added to them, as constants.
+            What kicks added to these states, as constants.
 
         Returns
         -------
@@ -257,8 +258,8 @@ class Model:
             row = int(np.argmin(np.isfinite(np.concatenate(slopes, axis=1)).all(axis=1)))
             given = ", ".join(f"{name}={x[row].tolist()}" for name, x in seeds.items())
             raise ValueError(
-                f"the gradient of row {row} is not finite, with {given}: if these are large, scale them "
-                "down; otherwise a formula has an infinite slope there"
+                f"the gradient of row {row} is not finite, with {given}: if these values are large, scale "
+                "them down; otherwise a formula has an infinite slope in this row"
             )
         slopes[1] = slopes[1].reshape(shape)
         return Gradient(*slopes)
@@ -270,7 +271,7 @@ class Model:
         return self._reversed[parameters]
 
     def expand(self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None) -> Expansion:
-        """Expand one step about each state and action: its motion to first order, its reward to second.
+        """Expand one step about each state and action: the motion to first order, the reward to second order.
 
         The motion's derivatives are those of the scene's control step. Guard and reward have kinks, which a
         planner should see if they lie within reach: their formulas are expanded by central differences of
@@ -294,7 +295,8 @@ class Model:
         formulas, form, k = self.task.formulas, form_of(self.task.scene), self._constants
         if formulas.choices:
             raise ValueError(
-                f"{type(self.task).__name__} has a list of actions to choose from, which have no derivatives"
+                f"{type(self.task).__name__} has a list of actions to choose from; "
+                "choices have no derivatives"
             )
         ends, _, _ = self(states, actions, targets)
         states = real_array("states", states)
@@ -374,9 +376,9 @@ class Model:
         """Return targets of shape (n, n_targets)."""
         count, fixed = self.task.formulas.targets, self.task.fixed_target
         if targets is not None and not count:
-            raise ValueError("this task has no target, got targets")
+            raise ValueError("this task has no target; leave targets out")
         if targets is None and count and fixed is None:
-            raise ValueError("the task's target is random: targets must be given")
+            raise ValueError("the task's target is random, so targets must be given")
         if targets is None:
             given = np.empty(0) if fixed is None else fixed
             return np.ascontiguousarray(np.broadcast_to(given, (n, count)))
@@ -389,7 +391,7 @@ class Model:
 
 
 def _rows(name: str, values: ArrayLike, shape: tuple[int, ...], single: bool = True) -> Array:
-    """Return finite values of a shape, or where `single` one number for all; or raise a ValueError."""
+    """Return finite values of a shape (or one number, if `single`), or raise a ValueError."""
     array = real_array(name, values)
     if array.shape != shape and not (single and array.ndim == 0):
         wanted = f"be one number or have shape {shape}" if single else f"have shape {shape}"
@@ -398,7 +400,7 @@ def _rows(name: str, values: ArrayLike, shape: tuple[int, ...], single: bool = T
 
 
 def _finite(name: str, values: Array) -> Array:
-    """Return the values, or raise a ValueError that names the first row which is not finite."""
+    """Return the values, or raise a ValueError that names the first row that is not finite."""
     bad = ~np.isfinite(values)
     if not bad.any():
         return values

@@ -1,7 +1,7 @@
 """Shapes become pixels, in the same way as on the leaderboard's page.
 
-Shapes are turned into outlines once, in their frames; a picture is then a pose for each frame and one
-compiled call.
+Shapes are turned into outlines once, in their frames. Painting a picture then takes a pose for each frame and
+one compiled call.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Outline(NamedTuple):
 
 
 class Pen:
-    """Paints the shapes of a picture; the image shows as much of the picture's window as it can.
+    """Paints the shapes of a picture; the picture's window is shown as large as the image allows.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ class Pen:
     strip : int
         Height of the free strip below [pixels].
     glass : float, optional
-        Show a square with sides of this length [m], without a margin, in place of the picture's window.
+        If given, a square with sides of this length [m] is shown, without a margin, in place of the picture's
+        window.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class Pen:
             self._magnify(image, lens, in_plane(poses[frame], lens.centre), poses, places)
 
     def _places(self, poses: Sequence[Pose], view: Window) -> NDArray[np.float64]:
-        """Return the maps of each frame, and last of the plane, to the image."""
+        """Return the maps of all frames, and finally of the plane, to the image."""
         places = np.empty((len(poses) + 1, 6))
         scale, (across, down) = self.scale, self._middle
         x0, y0 = 0.5 * (view.left + view.right), 0.5 * (view.bottom + view.top)
@@ -283,13 +284,13 @@ def _disc(centre: Point, radius: float, style: Style, unit: float) -> Polygons:
 
 
 def _rim(centre: Point, radius: float, unit: float) -> list[Point]:
-    """Return points of a circle, clockwise, as many as its size needs; the last equals the first."""
+    """Return points of a circle, clockwise and in a number that suits its size; the last equals the first."""
     n = min(max(12, math.ceil(7.0 * math.sqrt(max(radius, 0.0) / unit))), 300)
     return s.arc(centre, radius, 0.0, -2.0 * math.pi, n)
 
 
 def _arrow(points: list[Point], style: Style, unit: float) -> Polygons:
-    """Return an arrow with the length of its points; a short one is thinner."""
+    """Return an arrow with the length of its points; a short arrow is thinner."""
     length, width = sum(math.dist(a, b) for a, b in pairwise(points)), unit * style.width
     if length < 1.5 * unit:
         return []

@@ -46,8 +46,9 @@ def _text(text: str, size: int, colour: str) -> pygame.Surface:
 class Readout:
     """The strip below a picture; its columns do not shift with the length of the numbers.
 
-    A group of entries begins a new line, and is continued on the next if it is too long. If that takes more
-    than a third of the picture, entries follow each other without new lines, and the last ones are left out.
+    A group of entries begins a new line, and is continued on the next line if it is too long. If the groups
+    take more than a third of the picture, entries follow each other without new lines, and the last entries
+    are left out.
 
     Parameters
     ----------
@@ -71,7 +72,7 @@ class Readout:
         rows = places[-1][0] + 1
         is_beside = end <= width - self._bar - 24
         self._has_bar = rows + (not is_beside) <= most
-        #: For each entry its row, and where its name begins, its value ends and its unit begins.
+        #: For each entry, its row, and the places where its name begins, its value ends and its unit begins.
         self._places = [place for place in places if place[0] < most]
         self.height = 8 + ROW * min(most, rows + (not is_beside))
 
@@ -85,7 +86,7 @@ class Readout:
         groups : sequence of sequence of Reading
             The entries, with the same names and units as before; NaN is written as a dash.
         scale : float
-            Pixels per metre, of which a part is drawn.
+            Pixels per metre, for the scale bar.
         """
         pygame, (height, width) = load_pygame(), image.shape[:2]
         surface, top = pygame.image.frombuffer(image, (width, height), "RGB"), height - self.height
@@ -117,7 +118,7 @@ def _flow(groups: Sequence[Sequence[Reading]], width: int) -> tuple[list[tuple[i
 
 def _column(reading: Reading, x: int) -> tuple[int, int, int]:
     """Return where an entry's value ends, its unit begins and its unit ends, if it begins at x."""
-    # They depend only on what stays the same.
+    # These places depend only on what stays the same.
     right = x + max(_name_width(reading.name) + 54, 62)
     return right, right + 4, right + 4 + _text(reading.unit, 17, INK).get_width()
 

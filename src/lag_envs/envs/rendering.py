@@ -52,7 +52,7 @@ class Viewer:
     Parameters
     ----------
     task : Task
-        The task; it decides, with its scene, what is shown.
+        The task; together with its scene it decides what is shown.
     mode : {"human", "rgb_array"}
         Whether `draw` shows the picture in a window, in real time, or returns it.
     look : Look, optional
@@ -62,8 +62,8 @@ class Viewer:
 
     Notes
     -----
-    A process has one window; several viewers share it side by side. If its user closes it, the environments
-    continue without a picture until they are closed and rendered again.
+    A process has one window; several viewers share it side by side. If the user closes the window, the
+    environments continue without a picture until they are closed and rendered again.
 
     Raises
     ------
@@ -128,9 +128,9 @@ class Viewer:
         total : float
             Sum of its rewards so far.
         episode : int
-            A number that is different for each episode.
+            A number that identifies the episode.
         over : bool
-            Whether the episode is over, so that it has a score.
+            Whether the episode is over and therefore has a score.
 
         Returns
         -------
@@ -197,9 +197,10 @@ class Viewer:
                 yield StyledShape(arrow, STYLES["action"] if is_control else FORCE, 1.0)
 
     def _readings(self, now: Frame, seconds: float, total: float, over: bool) -> list[list[Reading]]:
-        """Return the groups of the read-out, in the order in which they give way to a lack of room.
+        """Return the groups of the read-out, the most important first.
 
-        An episode has a score only at its end: where rewards are negative, its beginning would score above 1.
+        An episode has a score only at its end: with negative rewards, the beginning of an episode would score
+        above 1.
         """
         task = self._task
         first = [Reading("time", seconds, "s"), Reading("return", total, ""), *task.control_readings(now)]
@@ -219,11 +220,11 @@ class Viewer:
     # --- real time ------------------------------------------------------------------------------------------
 
     def _is_due(self) -> bool:
-        """Return whether to show this step: if steps are faster than the window, only some are shown."""
+        """Return whether to show this step; if steps are faster than the window, only some are shown."""
         now = time.perf_counter()
         self._due += self._task.dt
         if not now - 0.25 < self._due:
-            self._due = now  # at the start, and after a delay, which is not made up for
+            self._due = now  # at the start, and after a delay; lost time is not made up for
         return self._due - self._shown > 1.0 / RATE - 1e-4
 
     def _wait(self) -> None:
@@ -233,7 +234,7 @@ class Viewer:
 
 
 def _scale(task: Task) -> tuple[float, float] | None:
-    """Return the returns with scores 0 and 1; None if the task's parameters are not the standard ones."""
+    """Return the returns that score 0 and 1, or None if the task's parameters are not the standard ones."""
     known, usual = measured_entry(task.id).get("scale"), type(task)()
     same = (task.scene, task.dt, task.duration) == (usual.scene, usual.dt, usual.duration)
     return (known["random"], known["best"]) if known and same else None
@@ -255,7 +256,7 @@ def tips(picture: Picture) -> dict[int, Point]:
 
 
 def paint(task: Task, now: Frame, size: tuple[int, int] = (WIDTH, HEIGHT)) -> NDArray[np.uint8]:
-    """Return a picture of a moment, of some size."""
+    """Return a picture of a moment, in a given size."""
     shown = Picture(task)
     poses = shown.poses(now)
     image = np.full((size[1], size[0], 3), 255, np.uint8)

@@ -27,7 +27,8 @@ from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
-#: Rows that go through the parts of a step together: few enough that intermediate results stay in a cache.
+#: Number of rows that go through the parts of a step together: few enough that intermediate results stay in a
+#: cache.
 ROWS = 4096
 
 
@@ -52,7 +53,7 @@ class Reverse:
         self._task, self._parameters = task, parameters
         if formulas.choices:
             raise ValueError(
-                f"{type(task).__name__} has a list of actions to choose from, which have no derivatives"
+                f"{type(task).__name__} has a list of actions to choose from; choices have no derivatives"
             )
         constants = task.formulas.constants()
         self._constants = [f"k_{name}" for name in constants]
@@ -96,8 +97,8 @@ class Reverse:
         Returns
         -------
         list of ndarray, shape (n, ...)
-            Not finite in rows whose given gradient is not finite or is too large; the others are as without
-            them.
+            Not finite in rows whose given gradient is not finite or is too large; these rows do not affect
+            the other rows.
         """
         check_turns(self._task.scene, states)
         check_turns(self._task.scene, ends)
@@ -123,7 +124,8 @@ class Reverse:
     def _in_parts(
         self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> None:
-        """Do the same as `pull`, into `out`, with the motion by itself; errors name the rows by `rows`."""
+        """Do the same as `pull`, into `out`, with the motion as a separate part; `rows` numbers the rows for
+        errors."""
         results = self._after(kicked)(self._numbers, y, a, g, z, *rest)
         last = np.flatnonzero(results[-1][:, 0] != 0.0)
         if len(last):
@@ -172,9 +174,9 @@ class Reverse:
         )
 
     def _reward_of(self, last: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> tuple[Any, Any]:
-        """Return the reward of a step after which the episode goes on, and 1 if it does not, else 0.
+        """Return the reward of an ordinary step, and 1 if the step ends the episode, else 0.
 
-        With `last`, return that of a step after which it does not, and 0.
+        With `last`, return the reward of a step that ends the episode, and 0.
         """
         given = lifted(self._form, y, xp), lifted(self._form, z, xp), u, g, k
         if last:
@@ -226,7 +228,7 @@ class Reverse:
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
         """Record the way back through the whole step: cotangents of y, a, g, no parameters.
 
-        The last result is 1 where this holds: the step is ordinary, and the episode goes on.
+        The last result is 1 where the whole record is valid: the step is ordinary, and the episode goes on.
         """
         stepper: Any = code_of(self._task.scene, self._task.dt)
         after = self._after_of(kicked, False, xp, k, y=y, a=a, g=g, **rest)

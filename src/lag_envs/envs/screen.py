@@ -35,7 +35,7 @@ def load_pygame() -> Any:
 
 
 class Shown(Protocol):
-    """What a window shows: something with a size."""
+    """An object that a window shows; it has a size."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -46,7 +46,8 @@ class Desk:
     """Keeps the window, and the places of the viewers in it."""
 
     def __init__(self) -> None:
-        # Weak, so that an environment that was dropped without being closed does not keep its place.
+        # These references are weak, so that an environment dropped without being closed does not keep its
+        # place.
         self._viewers: weakref.WeakKeyDictionary[Shown, None] = weakref.WeakKeyDictionary()
         self._screen: pygame.Surface | None = None
         self._places = 0
@@ -56,7 +57,7 @@ class Desk:
 
     def add(self, viewer: Shown) -> None:
         """Make room for a viewer."""
-        # Finalizers registered first run last: by then the viewer is no longer among these.
+        # Finalizers registered first run last: by then the viewer has left the list.
         weakref.finalize(viewer, self._tidy)
         self._viewers[viewer] = None
 
@@ -105,14 +106,14 @@ def _open_window(width: int, height: int) -> pygame.Surface:
 
 
 def check_display() -> None:
-    """Raise an error where SDL would open a window that nobody sees, unless its user asks for that."""
+    """Raise an error if SDL would open a window that nobody can see, unless the user asks for this."""
     pygame = load_pygame()
-    with contextlib.suppress(pygame.error):  # whoever opens a window is told why there is none
+    with contextlib.suppress(pygame.error):  # opening a window then raises an error with the reason
         pygame.display.init()
         unseen = pygame.display.get_driver() in ("offscreen", "dummy")
         if unseen and not os.environ.get("SDL_VIDEODRIVER"):
             pygame.display.quit()
-            raise Error(f"there is no display here; {REMEDY}")
+            raise Error(f"no display was found; {REMEDY}")
 
 
 desk = Desk()

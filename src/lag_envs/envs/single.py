@@ -41,7 +41,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     Parameters
     ----------
     task : str
-        The task, as "module:Class". The ids fix it.
+        The task, as "module:Class". With `gym.make` the id determines it.
     render_mode : {"human", "rgb_array"}, optional
         Whether `render` shows the scene in a window or returns a picture.
     diagnostics : bool, default False
@@ -50,8 +50,8 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Whether pictures have arrows for controls without arrows of their own, and for the forces that the
         scene names.
     show_trail : float, default 0.0 [s]
-        How far back the bodies' trails in pictures go. They join the states that `render` was called for, so
-        call it after every step.
+        How far back the bodies' trails in pictures go. A trail joins the states for which `render` was
+        called, so call `render` after every step.
     show_readout : bool, default False
         Whether time, return, controls and state are written below a picture, and the score once the episode
         is over. In small pictures the last of them are left out.
@@ -132,7 +132,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Parameters
         ----------
         seed : int, optional
-            Seed of the starts, targets and kicks of this and the following episodes; at least 0.
+            Seed for the starts, targets and kicks of this episode and of the following ones; at least 0.
         options : dict, optional
             ``"state"``: the start, in the scene's order and units; ``"target"``, if the task has one.
 
@@ -180,7 +180,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Parameters
         ----------
         action : array_like, shape (n_actions,), or int
-            The action, an int where values are listed; a finite number outside a range is clipped.
+            The action; an int if values are listed. A finite number outside its range is clipped.
 
         Returns
         -------
@@ -220,7 +220,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return observation, reward, over % 2 == 1, over >= 2, self._info() if self.diagnostics else {}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the scene; returns an RGB picture of shape (height, width, 3) for the mode "rgb_array"."""
+        """Draw the scene; in the mode "rgb_array", return an RGB picture of shape (height, width, 3)."""
         if self.render_mode is None:
             gym.logger.warn(
                 'no render mode is set; make the environment with render_mode="rgb_array" or "human"'
@@ -242,7 +242,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._viewer.draw(self.state, self.control, self.target, steps, self._total, episode, over)
 
     def get_keys_to_action(self) -> dict[str, NDArray]:
-        """Return the keys of `gymnasium.utils.play`: a and d for all controls' ends, else no control."""
+        """Return keys for `gymnasium.utils.play`: a and d move all controls to their limits."""
         formulas, space, rest = self.task.formulas, self.action_space, self.task.rest_action
         low, high = np.array(-formulas.largest), np.array(formulas.largest)
         if formulas.choices:
@@ -275,17 +275,19 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         )
 
     def set_state(self, snapshot: snapshots.Snapshot) -> None:
-        """Restore the state in which `get_state` was called; what follows has the same bits.
+        """Restore the state in which `get_state` was called; all later results have the same bits.
 
         Parameters
         ----------
         snapshot : Snapshot
-            A snapshot of this environment, or of one made alike, perhaps in another process.
+            A snapshot of this environment, or of one that was made in the same way, perhaps in another
+            process.
 
         Raises
         ------
         TypeError, ValueError
-            For something that is not a snapshot, or one of another environment; then nothing is changed.
+            For something that is not a snapshot, or a snapshot of another environment; then nothing is
+            changed.
         """
         snapshots.check_snapshot(snapshot, self._about, self._program.kept)
         for name, values in snapshot.rows.items():
@@ -334,7 +336,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _read(self, names: list[str]) -> NDArray[np.float64]:
         return self._rows[[self._row[name] for name in names]]
 
-    #: Sum of the episode's rewards, if pictures show it.
+    #: Sum of the episode's rewards, if pictures show this sum.
     _total = 0.0
 
     @property
@@ -383,13 +385,13 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return diagnostics(self.drawn_task.scene, self.state, np.float64(self.control))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out compiled functions and windows."""
+        """Return the state for pickling, without compiled functions and windows."""
         return {
             k: v for k, v in self.__dict__.items() if k not in ("_step", "_viewer", "_viewed", "_program")
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, and compile again (from the cache)."""
+        """Restore the pickled state, and compile again (from the cache)."""
         self.__dict__.update(state)
         self._program = program_of(self.task, [numbers_of(self.task)])
         self._bind()

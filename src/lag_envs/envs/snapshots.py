@@ -18,13 +18,13 @@ from lag_envs.tasks.imperfections import Imperfections
 class Snapshot:
     """The state of an environment or of a batch, as plain data that can be pickled.
 
-    Made by `get_state` of an environment, for `set_state` of the same environment or one made alike, in this
-    process or another: it then continues with the same bits.
+    A snapshot is made by `get_state`, for `set_state` of the same environment or of one that was made in the
+    same way, in this process or another. The environment then continues with the same bits.
 
     Attributes
     ----------
     about : mapping
-        The environment of the snapshot: task, parameters, options.
+        Properties of the environment that was saved: task, parameters, options.
     rows : mapping of str to ndarray, shape (num_envs,)
         The numbers from which a step starts: state, target, controls, clock, pending commands and
         observations, drawn parameters.
@@ -76,5 +76,5 @@ def check_snapshot(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) 
 
 
 def _common(values: list[Any]) -> Any:
-    """Return the value that all share, or else all values."""
+    """Return the value that all environments share, or else all values."""
     return values[0] if all(value == values[0] for value in values) else tuple(values)

@@ -11,7 +11,7 @@ from gymnasium.vector import VectorEnv
 def stagger(envs: VectorEnv, steps: int, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
     """Restart environments one after the other, so that from then on their episodes end one after the other.
 
-    Otherwise, if all episodes have the same length, a learner's roll-out sees only one phase of them.
+    Without this, if all episodes have the same length, a learner's roll-out sees only one phase of them.
 
     Parameters
     ----------

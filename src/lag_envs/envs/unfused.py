@@ -75,7 +75,7 @@ class Unfused:
         self._functions["derive"](self.constants)
 
     def _draws(self, count: int, purpose: str = "") -> list[float]:
-        """Return this step's draws, from the episode's own key or that of a purpose."""
+        """Return this step's draws, from the episode's own key or from the key of a purpose."""
         from lag_envs.stepping.primitives import episode_key, uniform
 
         key, step = np.uint64(self._key), np.uint64(self.steps)

@@ -46,13 +46,13 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     Made by ``gym.make_vec(id, num_envs=..., **parameters)``.
 
     Sub-environment i of a batch with seed s gives the same numbers, bit for bit, as the single environment
-    with seed s + i. (To rounding only, where a parameter is 0 in some of them and a scene has no flow of its
-    own; see docs/numerics.md.)
+    with seed s + i. (They agree only to rounding if a parameter is 0 in some environments of the batch and
+    the scene has no flow of its own; see docs/numerics.md.)
 
     Parameters
     ----------
     task : str or type
-        The task, a class or "module:Class". The ids fix it.
+        The task, as a class or as "module:Class". With `gym.make_vec` the id determines it.
     num_envs : int
         Number of environments.
     max_episode_steps : int, optional
@@ -72,9 +72,9 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     show_tiles : int, optional
         Show at most this many environments, side by side in one picture.
     **options
-        Parameters of the scene and of the task. `num_envs` values give each environment its own. Hidden
-        parameters, imperfect sensors and actuators as in `LagrangianEnv`: the same for all, but each
-        environment has its own draws.
+        Parameters of the scene and of the task. A list of `num_envs` values gives each environment its own
+        value. Hidden parameters, imperfect sensors and actuators are set as in `LagrangianEnv`: they are the
+        same for all environments, but each environment has its own draws.
 
     Notes
     -----
@@ -91,7 +91,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     (3, 5)
     """
 
-    #: Drawn parameters that viewers show, by environment.
+    #: Drawn parameters that viewers show, for each environment.
     _viewed: dict[int, dict[str, float]]
     _viewers: tuple[Any, ...] = ()  # defined even if __init__ fails and Gymnasium closes the environment
 
@@ -158,15 +158,15 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         #: Keys of the seeds, numbers of the episodes, keys of the episodes, and numbers that threads share.
         self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
         sharing.write_places(self._ids, self.num_envs, program.kept)
-        #: Number of the step, counted over all episodes, and how many threads it can keep busy.
+        #: Number of the step, counted over all episodes, and how many threads a step can keep busy.
         self._turn, self._most_threads = 0, min(blocks, self._num_threads or self.num_envs // sharing.SHARE)
         self._lanes = np.arange(self.num_envs)
-        for name in program.varying:  # drawn ones are written when an episode begins
+        for name in program.varying:  # drawn parameters are written when an episode begins
             values = [constants[name] for constants in self._constants]
             self._write(f"k_{name}", self._lanes, np.array(values))
         self._started = False
         self._over = self._starts = 0
-        #: Steps and sums of rewards of the episodes, if pictures show them.
+        #: Steps and sums of rewards of the episodes, if pictures show these.
         self._steps, self._totals = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
         self._seen = render_mode is not None and bool(show_readout or show_trail)
 
@@ -175,7 +175,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
         self._step_all = sharing.compile_step_all()
-        #: Type of the last actions, and where the loop over blocks for this type lies in memory.
+        #: Type of the last actions, and the place in memory of the loop over blocks for this type.
         self._kind: np.dtype | None = None
         self._loop = 0
         #: Arguments of the calls that helpers are offered, by their number and the type of actions.
@@ -191,8 +191,8 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         Parameters
         ----------
         seed : int or sequence of int, optional
-            A seed s seeds environment i with s + i; a list, tuple, range or array gives each its own seed,
-            None keeps the present one.
+            A seed s seeds environment i with s + i. A list, tuple, range or array gives each environment its
+            own seed; None, alone or in a list, keeps the present seed.
         options : dict, optional
             ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool.
             Several targets are (num_envs, n_targets), or a mapping of their names to one number for all or
@@ -264,7 +264,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         Parameters
         ----------
         actions : array_like, shape (num_envs, n_actions), or (num_envs,) where one list of values is given
-            Actions, ints where values are listed; finite numbers outside a range are clipped.
+            Actions; ints if values are listed. Finite numbers outside a range are clipped.
 
         Returns
         -------
@@ -274,11 +274,11 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         Raises
         ------
         ValueError
-            For actions that are not finite, not real or not of that shape; then nothing is stepped.
+            For actions that are not finite, not real or of another shape; then nothing is stepped.
         ResetNeeded
             Before the first reset; with autoreset disabled also if an episode is over.
         StepRefused
-            If an environment's step cannot be taken to full accuracy. That environment keeps its state; the
+            If an environment's step cannot be taken to full accuracy. That environment keeps its state; all
             others have been stepped.
         """
         actions = self._actions.many(actions, self.num_envs)
@@ -291,7 +291,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
                 "reset them with options['reset_mask']"
             )
         n, program = self.num_envs, self._program
-        # One row per entry is faster to fill; the caller gets the transpose.
+        # An array with one row per entry is faster to fill; the caller gets its transpose.
         observations = np.empty((len(program.o), n), FLOAT32)
         rewards, terminations, truncations = np.empty(n), np.empty(n, BOOL), np.empty(n, BOOL)
         arrays = (actions, observations, rewards, terminations, truncations)
@@ -324,7 +324,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         return results
 
     def render(self) -> Any:
-        """Return a picture (height, width, 3) of each environment, or with `show_tiles` one of them all."""
+        """Return a picture (height, width, 3) of each environment; with `show_tiles`, one of them all."""
         if self.render_mode is None:
             gym.logger.warn('no render mode is set; make the environment with render_mode="rgb_array"')
             return None
@@ -368,20 +368,20 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         return snapshots.Snapshot(self._about, rows, ids, steps, totals)
 
     def set_state(self, snapshot: snapshots.Snapshot, mask: NDArray[np.bool_] | None = None) -> None:
-        """Restore the state in which `get_state` was called; what follows has the same bits.
+        """Restore the state in which `get_state` was called; all later results have the same bits.
 
         Parameters
         ----------
         snapshot : Snapshot
-            A snapshot of this batch, or of one made alike, perhaps in another process.
+            A snapshot of this batch, or of one that was made in the same way, perhaps in another process.
         mask : ndarray of bool, shape (num_envs,), optional
             The environments to set; by default all. The others stay unchanged.
 
         Raises
         ------
         TypeError, ValueError
-            For something that is not a snapshot or not a mask, or a snapshot of another batch; then nothing
-            is changed.
+            For something that is not a snapshot or not a mask, or for a snapshot of another batch; then
+            nothing is changed.
         ResetNeeded
             Before the first reset, if the mask does not select all environments.
         """
@@ -417,7 +417,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
 
     @property
     def target(self) -> NDArray[np.float64] | None:
-        """The targets, shape (num_envs,), or (num_envs, n) if there are several; None without one."""
+        """The targets, shape (num_envs,), or (num_envs, n) if there are several; None if there are none."""
         names = self._program.g
         return single_number(np.stack([self._read(name) for name in names], axis=1)) if names else None
 
@@ -444,7 +444,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
 
     @property
     def order(self) -> int | None:
-        """Order of the general series; None if the scene has a flow of its own: then it cannot be set.
+        """Order of the general series; None if the scene has a flow of its own, and then it cannot be set.
 
         The order changes only the speed: each step is certified to the same tolerance with any order.
         """
@@ -455,7 +455,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     def order(self, value: int) -> None:
         name = self._program.order_constant
         if name is None:
-            raise ValueError(f"{type(self.task).__name__} has a flow of its own: there is no order to choose")
+            raise ValueError(f"{type(self.task).__name__} has a flow of its own, so no order can be chosen")
         for par in self._pars:
             par[self._program.uniform.index(name)] = check_order("order", value)
 
@@ -506,12 +506,12 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
 
     @property
     def ended(self) -> NDArray[np.bool_] | None:
-        """The environments whose episodes are over, as a mask; None if there are none."""
+        """A mask of the environments whose episodes are over; None if no episode is over."""
         return self._read("n") < 0.0 if self._over else None
 
     @property
     def moment(self) -> tuple[int, int]:
-        """Numbers of steps and of other starts: the states stay as they are while both do."""
+        """Numbers of steps and of other starts; while both stay the same, so do the states."""
         return self._turn, self._starts
 
     @property
@@ -543,14 +543,15 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     def _start(self, observations: NDArray[np.float32], mask: NDArray[np.bool_], *given: bool) -> None:
         """Begin episodes where the mask is set.
 
-        ``given``: whether to write all observations, whether states are given, whether targets are.
+        ``given`` says whether to write all observations, whether states are given, and whether targets are
+        given.
         """
         self._program.start_all(
             self._memory, self._ids, self._pars[0], observations.T, mask, *given, self.num_envs
         )
 
     def _get_help(self, actions: NDArray, *rest: Any) -> int:
-        """Ask other threads to take part in a step; return how many may take part, including this one."""
+        """Ask other threads to take part in a step; return how many may take part, including this thread."""
         shares, kind = min(self.num_threads, self._most_threads), actions.dtype
         if (calls := self._calls.get((shares, kind))) is None:
             while len(self._pars) < shares:
@@ -566,7 +567,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     def _restart(
         self, observations: NDArray[np.float32], over: NDArray[np.bool_], infos: dict[str, Any]
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin new episodes in the same step; the old ones' last observations and infos go into `infos`."""
+        """Begin new episodes in the same step; put the old ones' last observations and infos into `infos`."""
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(over):
             final[i] = observations[i].copy()
@@ -619,7 +620,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
     def _check_rows(
         self, name: str, values: Any, shape: tuple[int, ...], single: bool = False
     ) -> NDArray[np.float64]:
-        """Return values of a shape, or where `single` one number for all; or raise a ValueError."""
+        """Return values of a shape (or one number for all, if `single`), or raise a ValueError."""
         array = real_array(name, values)
         if array.shape != shape and not (single and array.ndim == 0):
             wanted = f"be one number or have shape {shape}" if single else f"have shape {shape}"
@@ -627,7 +628,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         return np.broadcast_to(array, shape)
 
     def _targets_by_name(self, given: Mapping[str, Any]) -> NDArray[np.float64]:
-        """Return targets given by name, each one number for all or one for each environment, as rows."""
+        """Return targets by name, each one number for all or one for each environment, as rows."""
         names = [t.name for t in self.task.formulas.target_boxes]
         if set(given) != set(names):
             raise ValueError(f"target must give {', '.join(names)}, got {shown(given)}")
@@ -641,19 +642,19 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         return rows[:, 0] if len(names) == 1 else rows
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out compiled functions, pictures, and the helpers' data."""
+        """Return the state for pickling, without compiled functions, pictures and the helpers' data."""
         without = ("_program", "_viewers", "_viewed", "_row", "_step_all", "_kind", "_loop", "_calls")
         return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, and compile again (from the cache)."""
+        """Restore the pickled state, and compile again (from the cache)."""
         self.__dict__.update(state)
         sharing.forget_helpers(self._ids, self.num_envs)
         self._compile()
 
 
 def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float64]:
-    """Return a copy in which number `first` begins a cache line, so that each vector lies on one line."""
+    """Return a copy with number `first` at the start of a cache line, so that each vector is on one line."""
     room = np.empty(len(numbers) + 8)
     start = (-(room.ctypes.data // 8) - first) % 8
     copy = room[start : start + len(numbers)]
@@ -694,13 +695,13 @@ def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def _is_one_target(kind: type[Task], values: Any) -> bool:
-    """Return whether a sequence has a number for each of several targets: the same for all environments."""
+    """Return whether a sequence has a number for each of several targets, which hold for all environments."""
     several = isinstance(kind.target, Mapping) and len(kind.target) > 1
     return several and not any(isinstance(v, (Mapping, list, tuple, np.ndarray)) for v in values)
 
 
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
-    """Return one task per environment, all the same object if no option varies."""
+    """Return a task for each environment; all are the same object if no option varies."""
     many = {
         name: values
         for name, values in options.items()
@@ -730,7 +731,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
             "the environments of a batch may differ in numbers only: they must agree in structural options, "
-            "in having a finite track or a fixed target, and in zeros that a formula divides by; "
+            "in whether the track is finite and the target fixed, and in zeros that a formula divides by; "
             f"got {shown(many)}"
         )
     if len({t.formulas.key for t in tasks}) > 1:

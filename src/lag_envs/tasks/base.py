@@ -403,7 +403,7 @@ class Task:
         return min((speed for speed in found if speed is not None), default=None)
 
     def chance(self, per_interval: float) -> float:
-        """Return an event's chance per step from its chance per interval: the rate does not depend on `dt`."""
+        """Return an event's chance per step from that per interval; any `dt` gives the same rate."""
         if self._recording is not None:
             return self._recording.chance(per_interval)
         if self.dt == self.interval:
