@@ -457,7 +457,7 @@ REFUSED = [
     ({"randomize": {"damping": (math.nan, 2)}}, "must be finite, got nan"),
     ({"randomize": {"damping": ("a", 2)}}, "must be a real number, got 'a'"),
     ({"randomize": {"damping": (0.5, 2, "lag")}}, "may come .*got 'lag'"),
-    ({"randomize": {"damping": (0.5, 2, "log", "uniform")}}, "one excludes the other"),
+    ({"randomize": {"damping": (0.5, 2, "log", "uniform")}}, "two of these words exclude each other"),
     ({"randomize": {"damping": (-1, 2)}}, "factors must be at least 0, got -1"),
     ({"randomize": {"damping": (0, 2, "log")}}, "must be above 0, got 0 to 2"),
     (
@@ -470,7 +470,7 @@ REFUSED = [
     ({"observation_noise": "much"}, "observation_noise must be a real number, got 'much'"),
     ({"observation_noise": {"x": 0.1}}, "no entry of the observation 'x', only s/S"),
     ({"observation_noise": {"s/S": math.inf}}, "must be finite and at least 0, got inf for s/S"),
-    ({"observation_noise": [0.1, 0.2]}, "or 5, for s/S"),
+    ({"observation_noise": [0.1, 0.2]}, "or 5 numbers, for s/S"),
     ({"observation_delay": -0.1}, "observation_delay must be at least 0 s, got -0.1 s"),
     ({"observation_delay": 500.0}, "observation_delay must be at most 20000 control steps, 400 s, got 500 s"),
     ({"observation_every": 0}, "observation_every must be a whole number .*got 0"),

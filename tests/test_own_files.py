@@ -205,7 +205,7 @@ def test_several_tasks_are_named(command, capsys):
 @pytest.mark.parametrize("command", ["info", "play", "bench"])
 def test_a_file_without_a_task(command, write, capsys):
     error = told(capsys, command, write(SCENE))
-    assert "defines no task (only Swing, which `lag-envs report" in error and "docs/tutorial.md" in error
+    assert "defines no task (only Swing, for which `lag-envs report" in error and "docs/tutorial.md" in error
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,8 @@ class UserError(Exception):
 def run_shown(program: str, run: Callable[[], int]) -> int:
     """Run a command, show its errors in a line, and treat SIGTERM like Ctrl-C; return its exit status.
 
-    It is 2 for a `UserError`, 1 if the system refuses something, as when a disk is full, 130 if interrupted.
+    The status is 2 for a `UserError`, 1 if the system refuses something, as when a disk is full, and 130 if
+    the command is interrupted.
     """
     with terminable():
         try:
@@ -46,12 +47,12 @@ def run_shown(program: str, run: Callable[[], int]) -> int:
 
 
 def _drop_output() -> None:
-    """Write nothing more to standard output, not even at exit."""
+    """Discard all further standard output, even that written at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def reason(error: OSError) -> str:
-    """Return what the system refused, and for which file.
+    """Return what the operating system refused, and for which file.
 
     Examples
     --------
@@ -66,16 +67,16 @@ def reason(error: OSError) -> str:
 
 
 def fault(path: str, file: str, error: Exception) -> str:
-    """Describe in one line what went wrong when a file was run, and where in it.
+    """Describe in one line what went wrong when a file was run, and in which line of the file.
 
     Parameters
     ----------
     path : str
-        The file as it is to be named.
+        The file's name for the message.
     file : str
-        The file as Python knows it.
+        The file's name in Python's traceback.
     error : Exception
-        What was raised.
+        The exception that was raised.
     """
     if isinstance(error, SyntaxError) and error.filename == file:
         return f"{path}, line {error.lineno}: {type(error).__name__}: {error.msg}"
@@ -85,7 +86,7 @@ def fault(path: str, file: str, error: Exception) -> str:
 
 
 def one_line(error: BaseException, most: int = 200) -> str:
-    """Return an error's kind and text as one line of so many characters at most."""
+    """Return an error's kind and text as one line of at most the given number of characters."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:most]
 
 
@@ -97,7 +98,7 @@ def terminable() -> Iterator[None]:
         return
 
     def stop(*_: Any) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop what is still saved
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second SIGTERM must not interrupt the saving
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)
@@ -108,7 +109,7 @@ def terminable() -> Iterator[None]:
 
 
 def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return the known names that might be meant, or where to find them.
+    """Return the known names that might be meant, or a text that says where to find them.
 
     Parameters
     ----------
@@ -126,7 +127,7 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
     >>> hint("Nope-v0", ["PivotedBar-v0", "Acrobot-v1"], "see the list")
     'see the list'
     """
-    # The version that ids end with would make any two of them alike.
+    # Without this, the version at the end of ids would make any two of them similar.
     known = list(known)
     names = {_without_version(k): k for k in known}
     close = [names[c] for c in difflib.get_close_matches(_without_version(name), names, n=3, cutoff=0.5)]
@@ -140,10 +141,10 @@ def _without_version(name: str) -> str:
 
 
 def warn_of_misspelt(kind: type, base: type) -> None:
-    """Warn of names in a class that are close to names of its base and that no method of the class uses.
+    """Warn of names in a class that resemble names of its base and that no method of the class uses.
 
-    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation. Classes of
-    this package that it is derived from are left out.
+    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation. Base
+    classes from this package are not searched.
     """
     classes = kind.__mro__[: kind.__mro__.index(base)]
     theirs = [c for c in classes if not c.__module__.startswith("lag_envs.")]

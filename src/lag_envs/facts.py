@@ -20,7 +20,7 @@ from lag_envs.tasks.imperfections import KEYWORDS
 
 
 class Keyword(NamedTuple):
-    """A keyword of an environment: its default, and in words its unit, its range and what it means."""
+    """A keyword of an environment: its default, and as text its unit, its range and its meaning."""
 
     name: str
     default: Any
@@ -30,7 +30,7 @@ class Keyword(NamedTuple):
 
 
 def facts(task: Task, name: str, formulas: str) -> list[str]:
-    """Return the lines: description, state, controls, observation, start, parameters, accuracy.
+    """Return lines on description, state, controls, observation, start, parameters and accuracy.
 
     `formulas` says where the task's formulas are.
     """
@@ -102,9 +102,10 @@ def _starts(task: Task) -> list[tuple[str, ...]]:
 
 
 def keywords(task: Task) -> list[Keyword]:
-    """Return what an environment takes: its parameters, `dt`, `duration`, the target, what pictures show.
+    """Return an environment's keywords, for parameters, `dt`, `duration`, the target and pictures.
 
-    Imperfections and `diagnostics` are not among them, and what a parameter means is for the scene to say.
+    Imperfections and `diagnostics` are not among these keywords. The meaning of a parameter is left to the
+    scene.
     """
     usable, rows = task.usable_ranges(), []
     for field in dataclasses.fields(task.scene):
@@ -129,7 +130,7 @@ def keywords(task: Task) -> list[Keyword]:
 
 
 def _range(declared: Mapping[str, Any], usable: tuple[float, float]) -> str:
-    """Return a parameter's range: the one in which the task is usable, or else the one that is declared."""
+    """Return a parameter's range: the range in which the task is usable, or else the declared range."""
     words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
     rules = [
         f"{word} {number_text(declared[key])}" for key, word in words.items() if declared.get(key) is not None
@@ -148,7 +149,7 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
 
 
 def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
-    """Yield the corners of the starts' box, or a sample if there are many, with controls at both limits."""
+    """Yield the corners of the starts' box, or a sample of many corners, with controls at both limits."""
     boxes = list(zip(task.centre, task.half_widths, strict=True))
     ends = {a.control: (a.low, a.high) for a in task.formulas.acting}
     for side in (0, 1):
@@ -169,7 +170,7 @@ def _accuracy(task: Task) -> list[str]:
             refused += 1
     lines = []
     if found and not any(bound.order for bound in found):
-        return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
+        return ["stepped in closed form, or by a series summed to rounding: one substep, nothing to certify"]
     if found:
         attempts = max(bound.substeps for bound in found)
         largest = max(max(bound.bounds.values(), default=0.0) for bound in found)
@@ -186,7 +187,7 @@ def _accuracy(task: Task) -> list[str]:
         shown, rate = math.floor(10.0 * speed) / 10.0, f"{layout_of(scene).free[0]}_dot"
         lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
     elif speed is not None:
-        lines += ["one substep is certified at no speed: the bound before each step decides their number"]
+        lines += ["one substep is certified at no speed: a bound before each step decides how many are taken"]
     if refused:
         lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
     return lines

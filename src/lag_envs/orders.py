@@ -11,11 +11,11 @@ from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
 from lag_envs.stepping.series import LARGEST_ORDER
 
-#: Even orders only: an odd one takes as much work as the next even one.
+#: Only even orders: an odd order takes as much work as the next even order.
 ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
-#: A lower order is preferred to one that is faster by less than this factor, which is within the noise.
+#: A lower order is preferred to an order that is faster by less than this factor, which is within the noise.
 SAME = 1.02
-#: Steps of a sample.
+#: Number of steps in a sample.
 STEPS = 20
 
 
@@ -44,8 +44,8 @@ def measure_orders(
     envs = LagrangianVectorEnv(task, num_envs)
     if envs.order is None:
         raise UserError(
-            f"{task.__name__} has a flow of its own, as {type(envs.scene).__name__} moves like a pendulum or "
-            "on a slope: only orders of the general series are measured"
+            f"{task.__name__} has a flow of its own, since {type(envs.scene).__name__} moves like a pendulum "
+            "or on a slope; only orders of the general series are measured"
         )
     envs.reset(seed=0)
     envs.action_space.seed(0)
@@ -73,14 +73,14 @@ def best_order(times: dict[int, float]) -> int:
 
 
 def lines(task: type[Any], times: dict[int, float], now: int) -> Sequence[str]:
-    """Return the table, and the advice for the task."""
+    """Return the lines of the table, and the advice for the task."""
     found = best_order(times)
     rows = [f"{order:5}  {taken:8.1f}  {taken / times[found]:5.2f}" for order, taken in times.items()]
     if times[now + now % 2] <= SAME * times[found]:
         advice = f"{task.__name__} is stepped by order {now}, which is as fast as any."
     else:
         advice = (
-            f"Write `order = {found}` into {task.__qualname__} ({task.__module__}), which is stepped by "
-            f"order {now} now."
+            f"Write `order = {found}` into {task.__qualname__} ({task.__module__}), which is now stepped by "
+            f"order {now}."
         )
     return ["order  ns a step  ratio", *rows, "", advice]

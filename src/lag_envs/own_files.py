@@ -53,7 +53,7 @@ def load_module(path: str) -> ModuleType:
     Raises
     ------
     UserError
-        If there is no such file, or it is not Python, or fails; with the line.
+        If the file does not exist, is not Python, or fails; the message then gives the line.
     """
     file = Path(path)
     if file.is_dir():
@@ -67,7 +67,7 @@ def load_module(path: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # As for `python FILE`: modules in its folder can be imported.
+    # As with `python FILE`, modules in the file's folder can be imported.
     if str(file.parent) not in sys.path:
         sys.path.insert(0, str(file.parent))
     sys.modules[name] = module
@@ -79,13 +79,14 @@ def load_module(path: str) -> ModuleType:
     except SystemExit as error:
         del sys.modules[name]
         raise UserError(
-            f'{path} exits when it is loaded; put code for scripts only under if __name__ == "__main__":'
+            f"{path} exits when it is loaded; put code that only scripts need under "
+            'if __name__ == "__main__":'
         ) from error
     return module
 
 
 def _name(file: Path) -> str:
-    """Return the name of a file's module: the file's own, unless another module has it."""
+    """Return the name for a file's module: the file's own name, unless another module has this name."""
     name = file.stem
     if not name.isidentifier():
         return "own_" + re.sub(r"\W", "_", name)
@@ -118,7 +119,7 @@ def scenes(path: str) -> dict[str, type[Any]]:
 
 
 def _classes(module: ModuleType) -> dict[str, type]:
-    """Return the classes of a module by their first names: an alias does not count as another class."""
+    """Return the classes of a module by their first names; an alias does not count as another class."""
     names: dict[type, str] = {}
     for name, value in vars(module).items():
         if isinstance(value, type) and value.__module__ == module.__name__:
@@ -132,19 +133,20 @@ def chosen_tasks(name: str) -> dict[str, type[Any]]:
     Raises
     ------
     UserError
-        If there are none.
+        If there are no tasks.
     """
     path, kind = split_path(name)
     found = tasks(path)
     if kind:
         if kind not in found:
             raise UserError(
-                f"{path} has no task {kind!r}; " + (hint(kind, found) if found else f"it has none: {GUIDE}")
+                f"{path} has no task {kind!r}; "
+                + (hint(kind, found) if found else f"the file defines no task at all; {GUIDE}")
             )
         return {kind: found[kind]}
     if not found:
         have = ", ".join(scenes(path))
-        more = f" (only {have}, which `lag-envs report {path}` takes)" if have else ""
+        more = f" (only {have}, for which `lag-envs report {path}` works)" if have else ""
         raise UserError(f"{path} defines no task{more}; derive one from lag_envs.tasks.Task, {GUIDE}")
     return found
 
@@ -161,7 +163,7 @@ def one(name: str) -> type[Any]:
 
 
 def made_with_defaults(kind: type[Any], path: str) -> Any:
-    """Return a task or scene with its defaults, or raise a UserError with the fault in its formulas or id."""
+    """Return a task or scene with its defaults, or raise a UserError for a fault in its formulas or id."""
     import gymnasium as gym
     from gymnasium.envs.registration import parse_env_id
 

@@ -124,8 +124,7 @@ class Reverse:
     def _in_parts(
         self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> None:
-        """Do the same as `pull`, into `out`, with the motion as a separate part; `rows` numbers the rows for
-        errors."""
+        """Do the same as `pull`, into `out`, with the motion as a part of its own; errors name `rows`."""
         results = self._after(kicked)(self._numbers, y, a, g, z, *rest)
         last = np.flatnonzero(results[-1][:, 0] != 0.0)
         if len(last):

@@ -20,8 +20,8 @@ _ANGLES = {
     "cos(theta_2)": ("1", "cosine of the second link's angle from the first, 1 straight"),
     "sin(theta_2)": ("1", "its sine"),
 }
-#: For learners with a replay buffer on the real machines, where a step is short and pays at most 0.02: eight
-#: steps count together. Below, noise is held for 0.05 s, and rewards are multiplied.
+#: For learners with a replay buffer on the real machines, where a step is short and pays at most 0.02, eight
+#: steps count together. Further below, noise is held for 0.05 s, and rewards are multiplied.
 _PATIENT = {"n_timesteps": 3e5, "n_steps": 8, "gamma": 0.995}
 
 
@@ -31,16 +31,16 @@ class AcrobotExact(Task):
     ## Description
 
     Two links hang from a pivot, with a motor only at the elbow. Swing them so that the tip gets one link's
-    length above the pivot, as soon as possible. Spaces, rewards, starts and endings are those of Gymnasium's
+    length above the pivot as soon as possible. Spaces, rewards, starts and endings are those of Gymnasium's
     `Acrobot-v1`, so a policy trained there runs here unchanged, and vice versa.
 
-    Two things differ. Gymnasium takes one Runge-Kutta step of 0.2 s at a time, so the energy of the undriven
-    links drifts by joules within an episode. Here the motion under the held torque is exact. And Gymnasium
-    clips the speeds at 4π and 9π rad/s, which removes energy without a physical cause. Here the speeds are
-    free, and only their observations are clipped.
+    Two things differ. First, Gymnasium takes one Runge-Kutta step of 0.2 s at a time, so the energy of the
+    undriven links drifts by joules within an episode. Here the motion under the held torque is exact. Second,
+    Gymnasium clips the speeds at 4π and 9π rad/s, which removes energy without a physical cause. Here the
+    speeds are free, and only their observations are clipped.
 
     The inertia of 1 kg m² about each centre of mass is kept, although no link of 1 kg and 1 m can have it: no
-    mass distribution within a link gives more than a quarter of that.
+    mass distribution within a link gives more than a quarter of this value.
 
     ## Action Space
 
@@ -64,12 +64,12 @@ class AcrobotExact(Task):
 
     ## Arguments
 
-    The parameters, constants of the class in Gymnasium, are keywords here. By default `damping_2` and
-    `dry_friction_2` equal the shoulder's.
+    The parameters, which are constants of the class in Gymnasium, are keywords here. By default `damping_2`
+    and `dry_friction_2` equal the shoulder's.
 
     ## Equations
 
-    They are those of Sutton and Barto's book, as in Gymnasium (`book_or_nips = "book"`).
+    The equations are those of Sutton and Barto's book, as in Gymnasium (`book_or_nips = "book"`).
 
     ## Signs and Units
 
@@ -96,7 +96,7 @@ class AcrobotExact(Task):
     quantities = {
         **_ANGLES,
         "theta_1_dot": ("rad/s", "angular velocity of the first link, clipped at 4π"),
-        "theta_2_dot": ("rad/s", "that of the second link relative to it, clipped at 9π"),
+        "theta_2_dot": ("rad/s", "angular velocity of the second link relative to the first, clipped at 9π"),
         "elbow_torque": ("N m", "torque at the elbow"),
     }
     scene: Any = Acrobot
@@ -164,7 +164,7 @@ class AcrobotExact(Task):
         return -xp.cos(after.theta_1) - xp.cos(after.theta_1 + after.theta_2) > 1.0
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Return the same: the episode ends there."""
+        """Return whether the tip has passed the line, which also ends the episode."""
         return self.reached(after, target, xp)
 
     def check_start(self, state: Any) -> None:
@@ -185,15 +185,15 @@ class AcrobotReal(Task):
 
     ## Description
 
-    The double pendulum of the RealAIGym project, with its identified parameters: two links with
-    quasi-direct-drive motors, friction in both joints, and here only the elbow driven. Swing both links up
+    This is the double pendulum of the RealAIGym project, with its identified parameters: two links with
+    quasi-direct-drive motors and friction in both joints. Here only the elbow is driven. Swing both links up
     and keep them upright.
 
     Parameters, torque limit, control interval, length of an episode and criterion of success are those of the
     project's published leaderboards [1]_: `design_C.1`, `model_1.0`, 6 N m, 0.002 s and 10 s. The project's
     simulations omit friction and rotors, but its machine has them, and so has this environment. The driven
     joint has the identified friction. The idle joint has none, because on the machine the idle motor
-    compensates it: it may use 0.5 N m for that, and friction takes at most half as much.
+    compensates its friction: this motor may use 0.5 N m, and friction takes at most half of it.
 
     .. [1] F. Wiebe et al., "Open Source Dual-Purpose Acrobot and Pendubot Platform", IEEE Robotics &
        Automation Magazine 31 (2024); github.com/dfki-ric-underactuated-lab/double_pendulum, folders
@@ -252,7 +252,7 @@ class AcrobotReal(Task):
     quantities = {
         **_ANGLES,
         "theta_1_dot/10": ("rad/s", "angular velocity of the first link, divided by 10"),
-        "theta_2_dot/20": ("rad/s", "that of the second link relative to it, divided by 20"),
+        "theta_2_dot/20": ("rad/s", "angular velocity of the second relative to the first, divided by 20"),
         "shoulder_torque": ("N m", "torque at the shoulder"),
         "elbow_torque": ("N m", "torque at the elbow"),
     }
@@ -277,7 +277,7 @@ class AcrobotReal(Task):
         "gravity": 9.81,
     }
     interval, steps = 0.002, 5000
-    order = 12  # friction divides the steps: 16 takes a little longer
+    order = 12  # friction divides the steps; order 16 takes a little longer
     action = {"elbow_torque": 6.0}
     start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.05)
     high = 0.9  # share of both lengths above which the tip is up, as in the project
@@ -397,7 +397,7 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (AcrobotReal's docstring, adapted
     __doc__ = (
         (AcrobotReal.__doc__ or "")
         .replace("by a motor at the elbow", "by a motor at the shoulder")
-        .replace("only the elbow driven", "only the shoulder driven")
+        .replace("only the elbow is driven", "only the shoulder is driven")
     )
     id = "PendubotReal-v0"
     defaults = {

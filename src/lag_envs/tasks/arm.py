@@ -33,8 +33,8 @@ class Reach(Task):
     ## Rewards
 
     Each step pays exp(-d/0.1)(1 - 0.05 (a₁² + a₂²)), with the hand's distance d from the point in metres at
-    the step's end and the actions a. Passing through the point pays next to nothing: the hand has to stay
-    there. With another `dt` rewards are scaled by dt/0.02.
+    the step's end and the actions a. Passing through the point pays next to nothing: the hand has to stay at
+    the point. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -51,7 +51,7 @@ class Reach(Task):
     ## Signs and Units
 
     SI units. θ₁ is measured from the horizontal, counter-clockwise, so the arm hangs at -π/2; θ₂ = 0 is
-    stretched. Neither is wrapped. The shoulder is the origin; x points right and y up.
+    stretched. Neither angle is wrapped. The shoulder is the origin; x points right and y up.
 
     ## Known Returns
 
@@ -65,13 +65,13 @@ class Reach(Task):
     id = "TwoLinkArm-v0"
     quantities = {
         "cos(theta_1)": ("1", "cosine of the upper arm's angle, 1 level to the right"),
-        "sin(theta_1)": ("1", "its sine, -1 hanging"),
+        "sin(theta_1)": ("1", "sine of the upper arm's angle, -1 hanging"),
         "cos(theta_2)": ("1", "cosine of the forearm's angle from the upper arm, 1 stretched"),
         "sin(theta_2)": ("1", "its sine"),
         "theta_1_dot/5": ("rad/s", "angular velocity of the upper arm, divided by 5"),
         "theta_2_dot/10": ("rad/s", "angular velocity of the forearm relative to it, divided by 10"),
         "goal_x": ("m", "place of the point to reach, to the right of the shoulder"),
-        "goal_y": ("m", "its height above the shoulder"),
+        "goal_y": ("m", "height of the point above the shoulder"),
         "shoulder": ("N m", "torque at the shoulder"),
         "elbow": ("N m", "torque at the elbow"),
     }

@@ -26,7 +26,7 @@ class _OnTrack(Task):
 
     scene: Any = CartPole
     interval, steps = 0.02, 500
-    order = 10  # the pole is slow: 16 takes half as long again, 8 nearly twice as long
+    order = 10  # the pole is slow: order 16 takes half as long again, order 8 nearly twice as long
     track = 2.4  # half length [m]
 
     def bodies(self) -> Bodies:
@@ -51,7 +51,7 @@ class _OnTrack(Task):
 
 
 class _Balance(_OnTrack):
-    """What the tasks share in which the pole stands at first, and must not fall."""
+    """What the tasks share in which the pole stands at first and must not fall."""
 
     highest = math.radians(12.0)  # [rad]
     examples = Examples(
@@ -79,10 +79,10 @@ class CartPoleExact(_Balance):
     and endings are those of Gymnasium's `CartPole-v1`, so a policy trained there runs here unchanged, and
     vice versa.
 
-    One thing differs. Gymnasium steps by explicit Euler, so the position after a step does not depend on that
-    step's push, and energy grows without a cause, to several times its initial value within ten seconds. Here
-    the motion under the held force is exact. At the end of an episode, values beyond the observation space
-    are clipped in the observation, not in the state.
+    One thing differs. Gymnasium steps by explicit Euler, so the position after a step does not depend on the
+    push of this step, and energy grows without a physical cause, to several times its initial value within
+    ten seconds. Here the motion under the held force is exact. At the end of an episode, values beyond the
+    observation space are clipped in the observation, not in the state.
 
     ## Action Space
 
@@ -90,8 +90,8 @@ class CartPoleExact(_Balance):
 
     ## Observation Space
 
-    Position and angle are bounded by twice the limits at which an episode ends. The speeds have no bound:
-    infinity, as in Gymnasium.
+    Position and angle are bounded by twice the limits at which an episode ends. The speeds have no bound;
+    their bounds in the space are infinite, as in Gymnasium.
 
     ## Rewards
 
@@ -111,7 +111,7 @@ class CartPoleExact(_Balance):
 
     ## Equations
 
-    They are Gymnasium's, which are solved for the accelerations there.
+    The equations are those of Gymnasium, which solves them for the accelerations.
 
     ## Signs and Units
 
@@ -193,7 +193,7 @@ class CartPoleContinuous(_Balance):
     ## Description
 
     A pole stands on a cart. Push the cart so that the pole stays up, while random kicks knock it off balance.
-    The model is that of Gymnasium's `CartPole-v1`, the force continuous.
+    The model is that of Gymnasium's `CartPole-v1`, but the force is continuous.
 
     ## Action Space
 
@@ -202,13 +202,14 @@ class CartPoleContinuous(_Balance):
     ## Observation Space
 
     The state, each entry divided by its typical range. Inside the limits below, position and angle lie in
-    [-1, 1]; the last step may lead beyond, and the speeds have no bound.
+    [-1, 1]; the last step may lead beyond these bounds. The speeds have no bound.
 
     ## Rewards
 
-    Each step pays (1 - (θ/0.21)²/2 - (x/2.4)²/2)(1 - 0.1 a²), taken at its end and before a kick, with the
-    action a; 0.21 rad are the 12 degrees below. Inside the limits the reward lies between 0 and 1, and the
-    effort is a factor, so that ending an episode never pays. With another `dt` rewards are scaled by dt/0.02.
+    Each step pays (1 - (θ/0.21)²/2 - (x/2.4)²/2)(1 - 0.1 a²), evaluated at the end of the step and before a
+    kick. Here a is the action, and 0.21 rad are the 12 degrees below. Inside the limits the reward lies
+    between 0 and 1, and the effort is a factor, so ending an episode never pays. With another `dt` rewards
+    are scaled by dt/0.02.
 
     ## Starting State
 
@@ -282,12 +283,12 @@ class CartPoleContinuous(_Balance):
         },
     }  # fmt: skip
     difficulty = (
-        "To move the cart to the middle, it must first be pushed away from it, and each kick hits a pole "
-        "that is never stable by itself."
+        "To move the cart to the middle, the agent must first push it away from the middle, and each kick "
+        "hits a pole that is never stable by itself."
     )
     note = (
-        "The LQR's weights have the size of the reward's; nobody tuned them further. MPC, which does not "
-        "foresee the kicks, is no better."
+        "The weights of the LQR have the size of those in the reward; nobody tuned them further. MPC, which "
+        "does not foresee the kicks, is no better."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -366,7 +367,7 @@ class CartPoleSwingUp(_OnTrack):
     id = "CartPoleSwingUp-v0"
     quantities = {
         "x/2.4": ("m", "place of the cart, divided by 2.4"),
-        "x_dot/4": ("m/s", "its speed, divided by 4"),
+        "x_dot/4": ("m/s", "speed of the cart, divided by 4"),
         "cos(theta)": ("1", "cosine of the pole's angle, 1 upright"),
         "sin(theta)": ("1", "its sine"),
         "theta_dot/8": ("rad/s", "its angular velocity, divided by 8"),

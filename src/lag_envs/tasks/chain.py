@@ -91,15 +91,15 @@ class SwingUp(GuardedTrack, _ChainTask):
 
     ## Observation Space
 
-    The bounds are proved for every accepted start. They assume that the support only adds energy, so real
-    episodes stay far within them.
+    The bounds are proved for every accepted start. The proof assumes that the support only adds energy, so
+    real episodes stay far within the bounds.
 
     ## Rewards
 
     Each step pays h⁴ - 0.02 (u/U)². The height h of the chain's end is 0 hanging and 1 upright, taken at
     the step's end; u is the acceleration that was applied. Because of the fourth power, a spinning chain
-    earns little, and so does one whose upper bar stands while the lower one hangs. With another `dt` rewards
-    are scaled by dt/0.02, so a second is always worth the same.
+    earns little, and so does a chain whose upper bar stands while the lower bar hangs. With another `dt`
+    rewards are scaled by dt/0.02, so a second is always worth the same.
 
     ## Starting State
 
@@ -182,9 +182,10 @@ class SwingUp(GuardedTrack, _ChainTask):
         **OFF_POLICY,
     }  # fmt: skip
     note = """
-The best known method plans anew for each start. MPC is nearly as good and needs no time before it: it begins
-with a recorded plan, and improves it on the way up. One recorded plan with time-varying feedback comes close,
-because all starts are close together. SAC and TD3 learn from fewer steps than the PPO in one file, and less.
+The best known method plans anew for each start. MPC is nearly as good and needs no time before the start: it
+begins with a recorded plan and improves this plan on the way up. One recorded plan with time-varying feedback
+comes close, because all starts are close together. SAC and TD3 take fewer steps than the PPO in one file, but
+learn less.
 """
 
     steps_of_plan, batch, iterations, price, strength = 65, 32, 120, 0.05, 0.95
@@ -206,7 +207,7 @@ because all starts are close together. SAC and TD3 learn from fewer steps than t
             rest=(0.0, 0.0, *(math.pi, 0.0) * self.scene.bars),
             weights=weights,
             effort=0.02,
-            extra={"s": 0.02 / self.length**2},  # something has to draw the support back
+            extra={"s": 0.02 / self.length**2},  # a cost has to draw the support back
         )
 
     @property
@@ -265,7 +266,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in t
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
     quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
-    # A plan that goes far beyond the catch drifts where this support can no longer correct it.
+    # A plan that goes far beyond the catch drifts to states where this support can no longer correct it.
     controllers = SwingUp.controllers | {
         "iLQR, to the catch": Controller("lag_envs.controllers.chain:replan", {"beyond": 1.1}, plans=True)
     }
@@ -284,10 +285,10 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted, as in t
         "that a strong one could."
     )
     note = """
-Planning anew for each start is best. When the board opened, the plans went on far beyond the catch; those
-that end with it have been found since and are better, so scores above one are possible. MPC, which improves a
-recorded plan on the way up, comes between planning before the start and following one recorded plan with
-time-varying feedback. All are close, because the starts are close together.
+Planning anew for each start is best. When the board opened, the plans went on far beyond the catch. Plans
+that end with the catch have been found since and are better, so scores above one are possible. MPC, which
+improves a recorded plan on the way up, comes between planning before the start and following one recorded
+plan with time-varying feedback. All methods are close, because the starts are close together.
 """
 
 
@@ -297,11 +298,12 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
     largest = 15.0
     steps_of_plan, batch, iterations, price, strength = 150, 28, 180, 0.02, 0.85
-    quick = MappingProxyType({})  # feedback cannot correct a plan at the control's limits
+    quick = MappingProxyType({})  # feedback cannot correct a plan that uses the control at its limits
 
     controllers = {
         **{name: SwingUp.controllers[name] for name in ("LQR", "plan + TVLQR")},
-        # What the regulator would lose is known for small deviations only, which here means very small ones.
+        # The cost that the regulator would add is known for small deviations only, which here means very
+        # small ones.
         "MPC": Controller(
             "lag_envs.controllers.mpc:renewed",
             {"beyond": 1.0, "every": 2, "near": 0.05},
@@ -346,7 +348,7 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
     __doc__ = (
         (SwingUpTriple.__doc__ or "")
         .replace("and hold it upright.", "and hold it upright, through noise.", 1)
-        .replace("The bounds are", "Each entry has normal noise. Without it the bounds are", 1)
+        .replace("The bounds are", "Each entry has normal noise. Without the noise, the bounds are", 1)
     )
     id = "TripleBarNoisy-v0"
     imperfections = {"observation_noise": 0.008}
@@ -390,9 +392,9 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
     )
     note = """
 The best agents follow a plan gently, on a filter's estimate. MPC, which renews the plan on the way up, loses
-the chain less often than one that follows it to its end. The PPO in one file, which sees the last few
-observations, gets nearly as high a return as the latter, but seldom holds all bars upright for good. With the
-exact state the chain is hardly ever lost. Nobody has tried to choose more informative motions.
+the chain less often than an agent that follows the plan to its end. The PPO in one file, which sees the last
+few observations, gets nearly as high a return as the latter agent, but seldom holds all bars upright for
+good. With the exact state the chain is hardly ever lost. Nobody has tried to choose more informative motions.
 """
 
     @property
@@ -407,8 +409,8 @@ class SwingUpAnywhere(SwingUp):
     ## Description
 
     Two uniform bars, one hinged to the end of the other, start at any angles, moving. Bring them upright by
-    moving their support, and again whenever a kick has thrown them over. No recorded plan fits more than
-    a few of the starts.
+    moving their support, and do so again whenever a kick has thrown them over. No recorded plan fits more
+    than a few of the starts.
 
     ## Action Space
 
@@ -462,7 +464,7 @@ class SwingUpAnywhere(SwingUp):
 
     ## Known Returns
 
-    The optimum is not known. It depends on the kicks.
+    The optimum is not known; it depends on the kicks.
 
     ## Version History
 
@@ -492,7 +494,7 @@ class SwingUpAnywhere(SwingUp):
     )
     note = """
 The best known method plans on the exact model, at the start and whenever a kick has spoilt the plan. Holding
-alone works only if the bars happen to pass upright slowly.
+the bars alone works only if they happen to pass upright slowly.
 """
 
     @property
@@ -524,9 +526,9 @@ class Balance(_ChainTask):
 
     ## Rewards
 
-    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, with the mean over the bars, taken at the step's end and
-    before a kick; S is half the track. Inside the limits the reward lies between 0 and 1. With another `dt`
-    rewards are scaled by dt/0.02.
+    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, evaluated at the step's end and before a kick. The mean
+    is over the bars, and S is half the track. Inside the limits the reward lies between 0 and 1. With another
+    `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
@@ -559,7 +561,7 @@ class Balance(_ChainTask):
 
     ## Known Returns
 
-    The optimum is not known. Some kicks cannot be survived, so it lies below 500.
+    The optimum is not known. Some kicks cannot be survived, so the optimum lies below 500.
 
     ## Version History
 
@@ -692,7 +694,7 @@ The LQR is tuned for small deviations; feedback with directly optimised gains su
         return over
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return how often the bars are balanced to the end."""
+        """Return how often the bars stay balanced to the end."""
         return {"episodes that last 10 s [%]": 100.0 * float((played.steps == self.limit).mean())}
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:

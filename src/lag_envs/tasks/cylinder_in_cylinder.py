@@ -14,7 +14,7 @@ from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
 
-#: For steps of 0.05 s: the horizon of 1/(1 - gamma) steps keeps its length in seconds.
+#: For steps of 0.05 s, so that the horizon of 1/(1 - gamma) steps keeps its length in seconds.
 _PPO = {"gamma": 0.98, "gae_lambda": 0.95}
 
 #: The observed quantities with their units.
@@ -108,14 +108,14 @@ class Tilt(_Shell):
     ## Description
 
     A solid cylinder rolls without slipping inside a larger hollow one, the shell. The shell is filled with a
-    medium that turns with it and drags. Turn the shell to bring the small cylinder to an angle and keep it
-    there.
+    medium that turns with the shell and drags the small cylinder along. Turn the shell to bring the small
+    cylinder to an angle and keep it at this angle.
 
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    It is clipped so that |ψ'| is at most 6 rad/s at the step's end.
+    The control is clipped so that |ψ'| is at most 6 rad/s at the step's end.
 
     ## Observation Space
 
@@ -219,7 +219,7 @@ class Tilt(_Shell):
     note = """
 iLQR is best; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 and
 SAC are better than PPO, with far fewer steps. They reach the target nearly as soon as the controllers. Most
-of their loss comes afterwards: they stop beside the target, while the controllers end on it.
+of their loss comes afterwards: they stop beside the target, while the controllers end on the target.
 """
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
@@ -267,13 +267,14 @@ class Pump(_Shell):
     ## Description
 
     A solid cylinder rolls inside a shell, with little drag and a weak drive. Pump its swing to the energy of
-    an amplitude of 0.9 rad, and keep it there. One push is not enough: the drive has to follow the swing.
+    an amplitude of 0.9 rad, and keep it at this energy. One push is not enough: the drive has to follow the
+    swing.
 
     ## Action Space
 
     `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    It is clipped so that |ψ'| is at most 3 rad/s at the step's end.
+    The control is clipped so that |ψ'| is at most 3 rad/s at the step's end.
 
     ## Observation Space
 
@@ -282,8 +283,8 @@ class Pump(_Shell):
     ## Rewards
 
     Each step pays exp(-|E - E*|/(0.3 E*)) - 0.02 (u/4)², taken at its end; u is the control that was applied.
-    E = θ'²/2 + ω₀² (1 - cosθ) is the energy per inertia, where ω₀² = k g/a. E* = 6.187/s² is that of the
-    amplitude. With another `dt` rewards are scaled by dt/0.05.
+    E = θ'²/2 + ω₀² (1 - cosθ) is the energy per inertia, where ω₀² = k g/a. E* = 6.187/s² is the energy of
+    the wanted amplitude. With another `dt` rewards are scaled by dt/0.05.
 
     ## Starting State
 
@@ -346,7 +347,7 @@ class Pump(_Shell):
         "fast_ppo": {
             "n_timesteps": 5e6, "n_epochs": 5, "reward_scale": 1.0, "episode_share": 1.0, "actor": [64, 64],
         },
-        # A push pays some steps later, and costs at once.
+        # A push pays only some steps later, but costs at once.
         "off_policy": {"gamma": 0.98, "n_steps": 4, "gradient_steps": 2, "learning_rate": "lin_2e-3"},
     }  # fmt: skip
     value_iteration = ValueIteration(
@@ -412,7 +413,7 @@ good as these two.
         return {**shapes, "limits": [*shapes["limits"], *marks]}
 
     def readings(self, now: Frame) -> list[Reading]:
-        """Tell the energy per inertia, and the wanted one."""
+        """Return the energy per inertia, and the wanted energy."""
         energy, wanted = self.energies(now.state, np)
         return [Reading("E", float(energy), "1/s²"), Reading("E*", float(wanted), "1/s²", "target")]
 
@@ -423,8 +424,8 @@ class Damping(Task):
     ## Description
 
     A solid cylinder rolls without slipping inside a fixed hollow one. The control is a brake: it sets the
-    coefficient of a drag that removes energy. Kicks put energy back. Bring the cylinder to rest at the
-    bottom. Braking as hard as possible is not optimal: it makes the cylinder creep.
+    coefficient of a drag that removes energy. Kicks add energy again. Bring the cylinder to rest at the
+    bottom. Braking as hard as possible is not optimal, because it makes the cylinder creep.
 
     ## Action Space
 
@@ -437,23 +438,24 @@ class Damping(Task):
 
     ## Rewards
 
-    Each step pays exp(-√(θ² + θ'²/ω₀²)/0.1), taken at its end and before a kick, with ω₀ = √(k g/a) =
-    4.0435/s. With another `dt` rewards are scaled by dt/0.02.
+    Each step pays exp(-√(θ² + θ'²/ω₀²)/0.1), evaluated at the end of the step and before a kick, with ω₀ =
+    √(k g/a) = 4.0435/s. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
-    High on the wall, moving. Given starts must have contact and |θ| at most 1,000 rad.
+    The cylinder is high on the wall and moving. For given starts there must be contact, and |θ| must be at
+    most 1,000 rad.
 
     After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes θ' by -3,
     -1.5, 1.5 or 3 rad/s, each equally likely.
 
     ## Episode End
 
-    Termination: contact is lost, N = m (a θ'² + g cosθ) < 0 at a step's end.
+    Termination: contact is lost, that is, N = m (a θ'² + g cosθ) < 0 at a step's end.
 
     ## Arguments
 
-    `control` must be "damping"; `damping` is a constant drag that adds to the brake.
+    `control` must be "damping"; `damping` is a constant drag that is added to the drag of the brake.
 
     Any combination of values in these ranges is allowed as long as the step is short enough for the swing: 2
     √(k g/a) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 + I/(m r²)). Every step is then taken,
@@ -535,15 +537,15 @@ class Damping(Task):
         },
     )
     difficulty = (
-        "Too little drag lets the cylinder swing on, too much makes it creep, and too much speed makes it "
-        "leave the shell: the best drag changes with the motion."
+        "Too little drag lets the cylinder swing on, too much drag makes it creep, and too much speed makes "
+        "it leave the shell, so the best drag changes with the motion."
     )
     note = """
 The greedy policy of value iteration is best. The switching line is as good within the uncertainty of these
-episodes: it lets go, and brakes fully as soon as that leads straight to rest. PPO is near rest as much of the
-time as the switching line, but very close to rest for less of it, because its network does not resolve the
-corner of the line. The PPO in one file, with more steps, is the best learner. TQC is as good as PPO within
-the uncertainty, with far fewer steps; SAC and TD3 are worse.
+episodes: it releases the brake, and brakes fully as soon as full braking leads straight to rest. PPO is near
+rest for as much of the time as the switching line, but very close to rest for less of the time, because its
+network does not resolve the corner of the line. The PPO in one file, with more steps, is the best learner.
+TQC is as good as PPO within the uncertainty, with far fewer steps; SAC and TD3 are worse.
 """
 
     def check(self) -> None:

@@ -52,7 +52,7 @@ class TargetBox:
 
 @dataclasses.dataclass(frozen=True)
 class Acting:
-    """How a control follows from an action: ``low + (high - low)(a + 1)/2``, or one of `values`."""
+    """How a control follows from an action: ``low + (high - low)(a + 1)/2``, or a value from `values`."""
 
     control: str
     unit: str
@@ -70,9 +70,9 @@ class RecordedStep(NamedTuple):
 
 
 class State(Values):
-    """The entries of a state; as ``q`` and ``v`` the places and velocities of its coordinates.
+    """The entries of a state; ``q`` and ``v`` hold the places and velocities of its coordinates.
 
-    A coordinate of that name hides these.
+    A coordinate named ``q`` or ``v`` hides them.
     """
 
     __slots__ = ("places",)
@@ -93,7 +93,7 @@ class Lifted:
     xp : namespace
         Computes everything else.
     known : sequence of (angle, cosine, sine)
-        An angle is recognised by identity: it is the very object that a formula gets.
+        An angle is recognised by identity, as the very object that a formula gets.
     """
 
     def __init__(self, xp: Any, known: Sequence[tuple[Any, Any, Any]]) -> None:
@@ -127,7 +127,8 @@ _NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imp
 class TaskFormulas:
     """The formulas of a task, as `lag_envs.envs.program` uses them.
 
-    If the scene has a normal form, states ``y`` and ``z`` are lifted: cosine and sine of its angle follow.
+    If the scene has a normal form, states ``y`` and ``z`` are lifted: the cosine and sine of the angle come
+    after the state.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ class TaskFormulas:
                 f"{self._of}.action mixes lists of values with ranges; "
                 "give every control a list, or every control a range"
             )
-        #: The action of the largest control.
+        #: The action for the largest control.
         self.largest = float(task.largest_action)
         if not 0.0 < self.largest < math.inf:
             raise FormulaError(
@@ -177,8 +178,8 @@ class TaskFormulas:
             names, code = self._recorded()
             if self._recorded()[1] != code:
                 raise FormulaError(
-                    f"{self._of}: a formula gives another result when it is run again; it may "
-                    "depend on its arguments and on parameters only, not on time or chance"
+                    f"{self._of}: a formula gives another result when it is run again; formulas may "
+                    "depend on their arguments and on parameters only, not on time or chance"
                 )
             known[key] = names, self._chances
         self.observation, self._chances = known[key]
@@ -213,11 +214,11 @@ class TaskFormulas:
 
     @property
     def key(self) -> tuple:
-        """What determines the code: tasks of a class that agree in it differ only in their numbers."""
+        """What determines the code: tasks of a class with the same key differ only in their numbers."""
         kind = type(self._task)
         plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
         if is_own(kind):
-            # What its formulas use besides are attributes, which may have been set by hand.
+            # Besides these, the task's formulas use attributes, which may have been set by hand.
             own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
             shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
             formulas: Any = (*(getattr(kind, name) for name in FORMULAS), *own, *shared)
@@ -285,7 +286,7 @@ class TaskFormulas:
         if carried:
             movers = ", ".join(str(p.control) for p in layout.at("rate"))
             why = (
-                f"the state holds {', '.join(carried)} instead, as velocities jump with {movers}; "
+                f"the state holds {', '.join(carried)} instead, because velocities jump with {movers}; "
                 f"write the formula with {carried[0]}"
             )
         return State(
@@ -317,15 +318,15 @@ class TaskFormulas:
                     raise
                 instead = f": write {INSTEAD[error.name]}" if error.name in INSTEAD else ""
                 raise FormulaError(
-                    f"it uses xp.{error.name}; a task's formula has xp.sin, cos, tan, atan, tanh, sqrt, exp, "
-                    f"log, where, abs, minimum, maximum, floor and pi{instead}"
+                    f"it uses xp.{error.name}, but a task's formula has only xp.sin, cos, tan, atan, tanh, "
+                    f"sqrt, exp, log, where, abs, minimum, maximum, floor and pi{instead}"
                 ) from error
             for key, value in vars(task).items():
                 kept = isinstance(getattr(type(task), key, None), cached_property)
                 if not kept and (key not in before or before[key] is not value):
                     raise FormulaError(
-                        f"it assigns to self.{key}, but it is run once and compiled; use its arguments, such "
-                        "as `before` in a reward, or entries of the state"
+                        f"it assigns to self.{key}, but a formula is run once and compiled; use the "
+                        "formula's arguments, such as `before` in a reward, or entries of the state"
                     )
             return result
 
@@ -337,7 +338,7 @@ class TaskFormulas:
         return self.largest * (2.0 * ((control - acting.low) / (acting.high - acting.low)) - 1.0)
 
     def shares(self, actions: Sequence) -> Sequence:
-        """Return actions as shares of the largest one; choices are unchanged."""
+        """Return actions as shares of the largest action; choices are unchanged."""
         if self.choices or self.largest == 1.0:
             return actions
         return [a * (1.0 / self.largest) for a in actions]
@@ -347,12 +348,12 @@ class TaskFormulas:
         return self.guarded(xp, self.wanted(xp, a), y, k)
 
     def wanted(self, xp: Any, a: Sequence) -> list:
-        """Return the controls that actions request, one for each that actions set."""
+        """Return the requested controls, one for each control that actions set."""
         shares = zip(self.acting, self.shares(a), strict=True)
         return [control_of(acting, share, xp) for acting, share in shares]
 
     def guarded(self, xp: Any, asked: Sequence, y: Sequence, k: Any) -> list:
-        """Return the controls that are applied if these are requested."""
+        """Return the controls that are applied if the given ones are requested."""
         wanted = dict.fromkeys(self._controls, 0.0)
         wanted |= {acting.control: u for acting, u in zip(self.acting, asked, strict=True)}
         if type(self._task).guard is self._base.guard:
@@ -518,7 +519,7 @@ class TaskFormulas:
             self._refuse("bounds", given, "bounds by name, or {} if none is known")
         self._check_names("bounds", "observation {!r}", given, self.observation)
         low, high, unbounded = [], [], self._task.unbounded
-        # An episode without an end has no bound, and a speed of 0 times infinity is NaN.
+        # In an episode without an end, entries have no bound, and a speed of 0 times infinity is NaN.
         endless = math.isinf(self._task.duration)
         for name in self.observation:
             bound = given.get(name, unbounded)
@@ -536,7 +537,7 @@ class TaskFormulas:
 
 
 def _in_order(what: str, names: Sequence[str], known: Mapping[str, Any], why: str = "") -> Values:
-    """Return numbers by coordinate: in the order of energies, where none is missing before them."""
+    """Return numbers by coordinate, and by index up to the first coordinate that is missing."""
     first = {name: known[name] for name in itertools.takewhile(known.__contains__, names)}
     return Values(what, first, known, why=why)
 
@@ -544,7 +545,7 @@ def _in_order(what: str, names: Sequence[str], known: Mapping[str, Any], why: st
 def _taking_states(scene: Any, name: str) -> Callable:
     """Return a formula of the scene that takes a state as places, and refuses one as velocities.
 
-    A state's entries have the names of places, but not their order; and they would be taken for velocities.
+    A state's entries have the names of places, but another order, and would be taken for velocities.
     """
     method = getattr(scene, name)
 
@@ -573,15 +574,15 @@ def _check_definition(task: Task, base: type[Task]) -> None:
     if kind.kick is not base.kick and not counted:
         raise FormulaError(
             f"{kind.__name__}.kick is defined, but not how many random numbers it takes: write draws = 1, "
-            "or however many"
+            "or the number that it takes"
         )
     if kind.kick is base.kick and task.draws:
-        raise FormulaError(f"{kind.__name__}.draws is {task.draws}, but there is no kick that takes them")
+        raise FormulaError(f"{kind.__name__}.draws is {task.draws}, but there is no kick to use these draws")
     warn_of_misspelt(kind, base)
 
 
 def _check_arguments(task: Task, base: type[Task]) -> None:
-    """Raise a FormulaError if a formula does not take what it is given."""
+    """Raise a FormulaError if a formula does not take the arguments that it is given."""
     for name in FORMULAS:
         method, wanted = getattr(task, name), list(inspect.signature(getattr(base, name)).parameters)
         if not callable(method):

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 #: No normal draw is larger: √(2 · 53 log 2), since the uniform number behind it is at least 2^-53.
 LARGEST_NORMAL = math.sqrt(106.0 * math.log(2.0)) * (1.0 + 1e-9)
-#: Control steps by which actions and observations may be late.
+#: Largest number of control steps by which actions and observations may be late.
 LATEST = 20_000
-#: Parameters that may be drawn: all corners of their ranges are tried.
+#: Largest number of parameters that may be drawn: all corners of their ranges are tried.
 MOST_DRAWN = 8
-#: A delay this near to a whole number of control steps is rounded to it [steps].
+#: A delay that is this close to a whole number of control steps is rounded to that number [steps].
 _WHOLE = 1e-9
-#: Bounds that are not proved are wider by this share; values beyond them are clipped.
+#: Bounds that are not proved are widened by this share; values beyond the bounds are clipped.
 MARGIN = 0.1
 
 
@@ -56,7 +56,7 @@ class Draw(NamedTuple):
         return float(self.printed(share, self.base, self.low, self.high, np))
 
     def printed(self, share: Any, base: Any, low: Any, high: Any, xp: Any) -> Any:
-        """Return the value at a share of the range, for recorded numbers too."""
+        """Return the value at a share of the range; numbers may be recorded."""
         if self.log:
             factor = xp.exp(xp.log(low) + share * (xp.log(high) - xp.log(low)))
         else:
@@ -85,7 +85,7 @@ class Imperfections:
     slew : tuple of float
         Largest change of each control that actions set [SI unit per second]; infinity for no limit.
     lag : tuple of float
-        1/τ of the actuator of each control of the scene [1/s]; 0 for one without a lag.
+        1/τ of the actuator of each control of the scene [1/s]; 0 for an actuator without a lag.
     push : tuple of float
         Largest size of a random impulse, for each entry of the state.
     push_rate : float
@@ -105,7 +105,7 @@ class Imperfections:
 
     @property
     def commands(self) -> int:
-        """Number of stored actions: those that may still come into force, and the one in force."""
+        """Number of stored actions: those that may still come into force, and the action in force."""
         return 1 + math.ceil(self.action_delay[1])
 
     @property
@@ -125,13 +125,13 @@ class Imperfections:
 
     @property
     def whole(self) -> bool:
-        """Whether commands change, and observations are taken, at the ends of control steps only."""
+        """Whether commands change and observations are taken only at the ends of control steps."""
         shortest, longest = self.action_delay
         return not (self.within or shortest < longest or longest % 1.0)
 
     @property
     def structure(self) -> tuple:
-        """What determines the code; everything else is its input."""
+        """What determines the code; all other numbers are its input."""
         return (
             tuple((d.name, d.log) for d in self.drawn),
             tuple(x > 0.0 for x in self.observation_noise),
@@ -153,7 +153,7 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
     Raises
     ------
     ValueError
-        Naming keyword, value and remedy.
+        If a keyword is wrong; the message names keyword, value and remedy.
     """
     own = type(task).imperfections
     for name in own:
@@ -178,9 +178,9 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
 
 
 def _numbers(keyword: str, value: Any, names: Sequence[str], what: str, missing: float) -> tuple[float, ...]:
-    """Return a number for each name: from one number for all, a mapping, or a sequence."""
+    """Return a number for each name, from one number for all, from a mapping, or from a sequence."""
     if not names:
-        raise ValueError(f"{keyword}: there is no {what} here, got {shown(value)}; leave it out")
+        raise ValueError(f"{keyword}: this task has no {what}, got {shown(value)}; leave it out")
     if isinstance(value, Mapping):
         for name in value:
             if name not in names:
@@ -189,8 +189,8 @@ def _numbers(keyword: str, value: Any, names: Sequence[str], what: str, missing:
     elif isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and np.ndim(value) == 1:
         if len(value) != len(names):
             raise ValueError(
-                f"{keyword} must be one number, one by name, or {len(names)}, for {', '.join(names)}; "
-                f"got {shown(value)}"
+                f"{keyword} must be one number for all, numbers by name, or {len(names)} numbers, for "
+                f"{', '.join(names)}; got {shown(value)}"
             )
         given = list(value)
     else:
@@ -206,7 +206,9 @@ def _sizes(keyword: str, value: Any, names: Sequence[str], what: str) -> tuple[f
     found = _numbers(keyword, value, names, what, 0.0)
     for name, x in zip(names, found, strict=True):
         if not 0.0 <= x < math.inf:
-            raise ValueError(f"{keyword} must be finite and at least 0, got {x:g} for {name}; 0 is off")
+            raise ValueError(
+                f"{keyword} must be finite and at least 0, got {x:g} for {name}; 0 switches it off"
+            )
     return found if any(found) else ()
 
 
@@ -215,7 +217,7 @@ def _seconds(keyword: str, value: Any, dt: float) -> float:
     delay = check_number(keyword, value, "s")
     if not 0.0 <= delay:
         raise ValueError(
-            f"{keyword} must be at least 0 s, got {delay:g} s: nothing is known before it happens"
+            f"{keyword} must be at least 0 s, got {delay:g} s: a delay cannot be negative"
         )
     steps = delay / dt
     if abs(steps - round(steps)) <= _WHOLE:
@@ -228,7 +230,7 @@ def _seconds(keyword: str, value: Any, dt: float) -> float:
 
 
 def _delays(keyword: str, value: Any, dt: float) -> tuple[float, float]:
-    """Return the shortest and the longest delay in control steps, from one for both or a sequence."""
+    """Return the shortest and the longest delay in control steps, from one number or from a pair."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, Sequence) or isinstance(value, str):
@@ -267,8 +269,8 @@ def _action_noise(task: Task, value: Any) -> dict[str, Any]:
     sizes = _sizes("action_noise", value, names, "control that actions set")
     if sizes and task.formulas.choices:
         raise ValueError(
-            f"action_noise is for actions in [-1, 1]; those of {type(task).__name__} are choices from a "
-            f"list, got {shown(value)}"
+            f"action_noise is for actions in [-1, 1]; the actions of {type(task).__name__} are choices from "
+            f"a list, got {shown(value)}"
         )
     return {"action_noise": sizes}
 
@@ -276,7 +278,7 @@ def _action_noise(task: Task, value: Any) -> dict[str, Any]:
 def _action_delay(task: Task, value: Any) -> dict[str, Any]:
     delays = _delays("action_delay", value, task.dt)
     if any(delays) and not task.formulas.acting:
-        raise ValueError(f"action_delay: there is no action here, got {shown(value)}; leave it out")
+        raise ValueError(f"action_delay: this task has no action, got {shown(value)}; leave it out")
     return {"action_delay": delays}
 
 
@@ -289,7 +291,7 @@ def _slew(task: Task, value: Any) -> dict[str, Any]:
         if not rate > 0.0:
             raise ValueError(
                 f"slew must be above 0, in the control's unit per second, got {rate:g} for {name}; "
-                "None is off"
+                "None switches it off"
             )
     return {"slew": rates if any(map(math.isfinite, rates)) else ()}
 
@@ -308,7 +310,7 @@ def _push(task: Task, value: Any) -> dict[str, Any]:
     moving = [e.name for e in layout.state if e.coordinate in layout.free and e.kind != "place"]
     rate = check_number("push: its rate", value[0], "1/s")
     if rate < 0.0:
-        raise ValueError(f"push: its rate must be at least 0, got {rate:g}; 0 is off")
+        raise ValueError(f"push: its rate must be at least 0, got {rate:g}; 0 switches it off")
     sizes = dict(zip(moving, _sizes("push: its size", value[1], moving, "free velocity"), strict=False))
     if rate == 0.0 or not sizes:
         return {}
@@ -331,11 +333,12 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
     if name not in (numbers := parameter_names(scene)):
         known = [*inspect.signature(type(scene)).parameters, "dt", "duration", "target"]
         why = "it decides how the environment is built" if name in known else "there is no such parameter"
-        raise ValueError(f"{where}: it cannot be drawn, {why}; what can be is {', '.join(numbers)}")
+        raise ValueError(
+            f"{where}: this cannot be drawn, because {why}; choose from {', '.join(numbers)}"
+        )
     if not isinstance(given, Sequence) or isinstance(given, str) or len(given) < 2:
         raise ValueError(
-            f'{where} must be (low, high), followed by "log" and "absolute" where they are meant, got '
-            f"{shown(given)}"
+            f'{where} must be (low, high), optionally followed by "log" and "absolute", got {shown(given)}'
         )
     words = list(given[2:])
     for word in words:
@@ -345,7 +348,7 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
                 f"got {shown(word)}"
             )
     if {"log", "uniform"} <= set(words) or {"absolute", "relative"} <= set(words):
-        raise ValueError(f"{where}: one excludes the other, got {shown(given)}")
+        raise ValueError(f"{where}: two of these words exclude each other, got {shown(given)}")
     low, high = (check_number(where, x) for x in given[:2])
     if not low < high:
         raise ValueError(f"{where}: low must be below high, got {shown(given)}")
@@ -356,7 +359,7 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
             raise ValueError(f"{where}: factors must be at least 0, got {low:g}")
         if math.isinf(base):
             raise ValueError(
-                f"{where}: {name} is {base:g}, which has no range of factors; give its range in its unit, "
+                f"{where}: {name} is {base:g}, to which no factor can apply; give its range in its unit, "
                 '(low, high, "absolute")'
             )
     if log and not low > 0.0:
@@ -394,7 +397,7 @@ class Drawn:
     Raises
     ------
     ValueError
-        If a corner of the ranges is not a possible task, or would need different code.
+        If a corner of the ranges is not a possible task, or needs different code.
     """
 
     def __init__(self, task: Task) -> None:
@@ -404,7 +407,7 @@ class Drawn:
         self._corners = [
             self.at(ends) for ends in itertools.product(*((d.at(0.0), d.at(1.0)) for d in self.draws))
         ]
-        #: One with values inside all ranges.
+        #: A task with values inside all ranges.
         self.inner = self.at([d.at(0.37 + 0.03 * i) for i, d in enumerate(self.draws)])
         for corner in self._corners:
             self._compare(corner)
@@ -426,7 +429,7 @@ class Drawn:
         raise ValueError(
             f"randomize allows {_listed(values)}, where the formulas of {type(corner).__name__} differ from "
             "those inside the ranges: an attribute that it computes from parameters, or a zero that a "
-            "formula divides by, would not follow; narrow the ranges, or draw other parameters"
+            "formula divides by, would keep its value; narrow the ranges, or draw other parameters"
         )
 
     @cached_property
@@ -462,10 +465,10 @@ def _listed(values: Mapping[str, float]) -> str:
 def seen_box(task: Task) -> tuple[list[float], list[float]]:
     """Return the lowest and highest values that an environment of this task shows.
 
-    Its bounds are those of the task, for all parameters that may be drawn, and wider by the largest noise.
-    Tasks prove their bounds for given parameters, for controls that follow their commands, and for the ends
-    of control steps. There is a margin for parameters between those that were tried, for observations within
-    a step, and for a lag, which no guard can foresee.
+    The environment's bounds are those of the task for all parameters that may be drawn, widened by the
+    largest noise. Tasks prove their bounds for given parameters, for controls that follow their commands, and
+    for the ends of control steps. A margin allows for parameters between those that were tried, for
+    observations within a step, and for a lag, which no guard can foresee.
     """
     found = task.imperfections
     if found is None:

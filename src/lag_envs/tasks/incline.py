@@ -35,7 +35,7 @@ class Tilt(Task):
 
     A solid cylinder rolls without slipping on a plane that turns about its middle. Bring it to a mark and
     keep it there. The control is the rate at which the plane turns. The plane carries the cylinder, so
-    turning it also pushes.
+    turning the plane also pushes the cylinder.
 
     ## Action Space
 
@@ -56,7 +56,7 @@ class Tilt(Task):
 
     ## Starting State
 
-    Anywhere near the middle, slowly rolling. Given starts must lie inside the limits.
+    The cylinder is anywhere near the middle and rolls slowly. Given starts must lie inside the limits.
 
     ## Episode End
 
@@ -71,8 +71,8 @@ class Tilt(Task):
 
     ## Equations
 
-    While the rate is held, φ̈ = 0. When it changes, x' jumps by -R times the change. The speed w = x' + R
-    φ', which is proportional to the momentum, does not jump, so w is in the state.
+    While the rate is held, φ̈ = 0. When the rate changes, x' jumps by -R times the change. The speed w = x' +
+    R φ', which is proportional to the momentum, does not jump, so w is in the state.
 
     ## Signs and Units
 
@@ -155,8 +155,8 @@ class Tilt(Task):
     )
     note = """
 iLQR is best, ahead of the cascade and of the greedy policy of value iteration, whose values are interpolated
-between targets. PPO reaches the mark later than the cascade, and stops beside it, while the cascade ends on
-it.
+between targets. PPO reaches the mark later than the cascade, and stops beside the mark, while the cascade
+ends on the mark.
 """
 
     def check(self) -> None:
@@ -290,7 +290,7 @@ class Brake(Task):
 
     A solid cylinder rolls without slipping down a slope of 15°. The control is a brake: it sets the
     coefficient of a drag. Let the cylinder cross a line soon, at 0.5 m/s or less. Time and excess speed both
-    cost.
+    reduce the return.
 
     ## Action Space
 
@@ -298,7 +298,7 @@ class Brake(Task):
 
     ## Observation Space
 
-    The bounds are proved for every accepted start, at most 1,000 m before the line.
+    The bounds are proved for every accepted start; starts lie at most 1,000 m before the line.
 
     ## Rewards
 
@@ -308,7 +308,7 @@ class Brake(Task):
 
     ## Starting State
 
-    Before the line, which is at x = 0, and not moving uphill.
+    The cylinder is before the line, which is at x = 0, and does not move uphill.
 
     ## Episode End
 
@@ -334,9 +334,9 @@ class Brake(Task):
 
     ## Known Returns
 
-    The optimum is known: roll freely, then brake fully from the best moment on. No policy exceeds it.
-    `lag_envs.controllers.optimal_return` returns it for any start. The best known policy acts at intervals
-    and so falls slightly short of it.
+    The optimum is known: roll freely, then brake fully from the best moment on. No policy exceeds this
+    return. `lag_envs.controllers.optimal_return` returns it for any start. The best known policy acts at
+    intervals and therefore falls slightly short of the optimum.
 
     ## Version History
 
@@ -351,7 +351,7 @@ class Brake(Task):
     }
     scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
-    usable = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
+    usable = {"tilt": (0.0, math.pi / 2)}  # otherwise the cylinder would not roll down
     action = {"drag": (0.0, 6.0)}
     start = {"x": (-2.0, 1.0), "x_dot": (0.5, 0.5)}
     scaled = False
@@ -388,7 +388,7 @@ class Brake(Task):
             "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 3.0}}],
             "policy_kwargs": {"noise_steps": 16},
         },
-        # Else the actor runs ahead of the critics and ends where its slope vanishes: at full braking.
+        # Otherwise the actor runs ahead of the critics and ends where its slope vanishes, at full braking.
         "td3": {
             "learning_rate": "lin_1e-3", "gradient_steps": 4, "policy_delay": 8,
             "policy_kwargs": {"noise_steps": 16, "noise": 0.3},
@@ -416,17 +416,17 @@ class Brake(Task):
         },
     )
     difficulty = (
-        "Braking early wastes time, braking late crosses too fast. The best policy switches once, at a "
-        "place that depends on the initial speed."
+        "Braking early wastes time, and with late braking the cylinder crosses too fast. The best policy "
+        "switches once, at a place that depends on the initial speed."
     )
     note = """
 The switching line is best: roll freely, then brake fully along the curve that meets the line at the right
 speed. It is slightly below the optimum, which may switch in the middle of a step. It beats the greedy policy
 of value iteration, whose grid smears the moment of switching. PPO has found the same strategy, but usually
 crosses a little too early and too fast, which costs more than the time it saves. The PPO in one file is as
-good, without a discount and with twice the steps. SAC and TQC get most of the way with a fifth of PPO's
-steps. They need returns over several steps. TD3 gets less far. Unless its actor learns much more slowly than
-its critics, it soon brakes fully everywhere, for good.
+good, without a discount and with twice as many steps. SAC and TQC get most of the way with a fifth of PPO's
+steps. They need returns over several steps. TD3 does not get as far. Unless its actor learns much more slowly
+than its critics, it soon brakes fully everywhere, and never stops doing so.
 """
 
     def check(self) -> None:
@@ -490,7 +490,7 @@ its critics, it soon brakes fully everywhere, for good.
         return {**shapes, "line": [line], "glass": [Magnifier((0.0, 0.0), 2.2 * radius)]}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return their places; the ground begins before the line, or before a cylinder farther away."""
+        """Return the places of line and cylinder; the ground begins before both of them."""
         scene, x, phi = self.scene, now.q.x, now.q.phi
         start = xp.minimum(-3.2, x - 0.2)
         return {
@@ -509,7 +509,7 @@ its critics, it soon brakes fully everywhere, for good.
         return Window(near[0], far[1], far[0], near[1], "hill")
 
     def readings(self, now: Frame) -> list[Reading]:
-        """Tell the speed at which the line should be crossed."""
+        """Return the speed at which the line should be crossed."""
         return [Reading("x_dot*", self.gentle, "m/s", "target")]
 
     def check_start(self, state: Any) -> None:

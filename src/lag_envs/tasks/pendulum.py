@@ -61,11 +61,11 @@ class PendulumExact(_Rod):
     length of an episode are those of Gymnasium's `Pendulum-v1`, so a policy trained there runs here
     unchanged, and vice versa.
 
-    Two things differ. Gymnasium steps by semi-implicit Euler: within a swing the energy of the undriven rod
-    is off by several per cent. Here the motion under the held torque is exact. And Gymnasium clips the rod's
-    speed at 8 rad/s, which removes energy without a physical cause. Here the speed is free, and only its
-    *observation* is clipped, to the same 8 rad/s that the space allows. Random actions often exceed that
-    speed. The reward uses the true one.
+    Two things differ. First, Gymnasium steps by semi-implicit Euler, so within a swing the energy of the
+    undriven rod is off by several per cent. Here the motion under the held torque is exact. Second, Gymnasium
+    clips the rod's speed at 8 rad/s, which removes energy without a physical cause. Here the speed is free,
+    and only its *observation* is clipped, to the same 8 rad/s that the space allows. Random actions often
+    exceed that speed. The reward uses the true speed.
 
     ## Action Space
 
@@ -117,7 +117,7 @@ class PendulumExact(_Rod):
 
     id = "PendulumExact-v0"
     peer = "Pendulum-v1"
-    order = 20  # random torques turn the rod fast: with 16, six steps in a hundred are divided
+    order = 20  # random torques turn the rod fast: with order 16, six steps in a hundred are divided
     quantities = {
         **_Rod.direction,
         "theta_dot": ("rad/s", "angular velocity, clipped at 8"),
@@ -193,8 +193,8 @@ class PendulumRegret(_Rod):
 
     A uniform rod hangs from a motor that is too weak to lift it in one go. Swing it up and hold it. The
     reward is special: it is constructed backwards, from a value function and a policy that were chosen first
-    (converse optimality [1]_), on the exact motion of the step. So the regret of any policy is known to
-    rounding: there is no "best known" return that could be beaten.
+    (converse optimality [1]_), on the exact motion of the step. Therefore the regret of any policy is known
+    to rounding, and there is no "best known" return that could be beaten.
 
     .. [1] J. C. Doyle, J. A. Primbs, B. Shapiro and V. Nevistić, "Nonlinear games: examples and
        counterexamples", IEEE Conference on Decision and Control (1996), 3915-3920.
@@ -206,22 +206,23 @@ class PendulumRegret(_Rod):
     ## Observation Space
 
     The angle's cosine and sine, and the speed, divided by 8. The speed's bound is proved: it is the largest
-    speed that torque and weight can add within an episode, and friction only reduces it.
+    speed that torque and weight can add within an episode. Friction only reduces the speed.
 
     ## Rewards
 
     Let V be the potential energy that the rod lacks to be upright, plus its kinetic energy, as a share of the
-    potential energy between hanging and upright, times 100. And let π be a control law: far from upright a
-    torque that pumps the energy to that of the upright equilibrium, near it a damped spring. Each step pays
+    potential energy between hanging and upright, times 100. Let π be a control law: far from upright, a
+    torque that pumps the energy to that of the upright equilibrium; near upright, a damped spring. Each step
+    pays
 
     V(before) - V(after) - 0.2 ((u - π(before))/U)².
 
-    The sum over an episode is V(start) - V(end) - 0.2 Σ((u - π)/U)². As V is nowhere negative, no policy gets
-    more than V(start); π gets V(start) - V(end), and brings V close to 0.
+    The sum over an episode is V(start) - V(end) - 0.2 Σ((u - π)/U)². Because V is nowhere negative, no policy
+    gets more than V(start). The law π gets V(start) - V(end), and brings V close to 0.
 
-    The task is still not trivial. The law is not observed. Pumping raises V at first, so a policy that
-    maximises the next reward brakes the rod and keeps it hanging: the penalty is small compared with that.
-    With another `dt`, V's share of the reward is not scaled, so the bound remains valid.
+    The task is still not trivial. An agent does not observe the law. Pumping raises V at first, and the
+    penalty is small compared with this rise, so a policy that maximises the next reward brakes the rod and
+    keeps it hanging. With another `dt`, V's share of the reward is not scaled, so the bound remains valid.
 
     ## Starting State
 
@@ -302,8 +303,8 @@ class PendulumRegret(_Rod):
         "first."
     )
     note = (
-        "The optimal law loses only V at the end, by how far the rod is from upright. A good swing-up of "
-        "another kind is penalised for each torque that differs."
+        "The optimal law loses only V at the end, which shows how far the rod is from upright. A good "
+        "swing-up of another kind is penalised for each torque that differs."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:

@@ -15,7 +15,7 @@ from lag_envs.tasks.base import FASTEST_START
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
 from lag_envs.tasks.track import GuardedTrack, Support
 
-#: Episodes of 5 s contain swing-ups twice as often; evaluation episodes last 10 s.
+#: In training, episodes of 5 s contain swing-ups twice as often as those of 10 s, which evaluation uses.
 _SHORT = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 250}}
 #: Returns that grow from nothing to hundreds are scaled by a constant, not by their running spread.
 _SCALED = {"normalize": False, "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 0.1}}]}
@@ -78,7 +78,7 @@ class SwingUp(GuardedTrack, _Bar):
 
     ## Arguments
 
-    `track=math.inf` is an endless track (the observation then divides s by 0.5 m), `track=None` is no
+    `track=math.inf` is an endless track (the observation then divides s by 0.5 m), and `track=None` means no
     track.
 
     Any combination of values in these ranges is allowed as long as the step is short enough for the swing: 2
@@ -272,8 +272,8 @@ class SwingUpUnknown(SwingUp):
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step, the one after
-    the step in which it is given; in the first step the support keeps its speed.
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step: the step after
+    the one in which it is given. In the first step the support keeps its speed.
 
     The support must be able to stop inside its track, braking at 5 m/s². If the requested acceleration would
     make that impossible, the nearest one that allows it is applied.
@@ -300,9 +300,9 @@ class SwingUpUnknown(SwingUp):
 
     ## Arguments
 
-    Those of `PivotedBar-v0`. `randomize=None`, `observation_noise=None` and `action_delay=None` switch the
-    imperfections off. Factors apply to the given parameters; every bar that may be drawn must lie in the
-    ranges.
+    The arguments are those of `PivotedBar-v0`. `randomize=None`, `observation_noise=None` and
+    `action_delay=None` switch the imperfections off. Factors multiply the given parameters; the parameters of
+    every bar that may be drawn must lie in the ranges.
 
     ## Signs and Units
 
@@ -311,7 +311,8 @@ class SwingUpUnknown(SwingUp):
 
     ## Known Returns
 
-    The optimum is not known. It is below the return of a controller that is designed for each episode's bar.
+    The optimum is not known. It lies below the return of a controller that is designed for each episode's
+    bar.
 
     ## Version History
 
@@ -333,13 +334,13 @@ class SwingUpUnknown(SwingUp):
     }
     hyperparameters = {
         **SwingUp.hyperparameters,
-        # In a trial, frames gained nothing at a learning rate of 8e-3.
+        # In a trial, stacked frames gained nothing at a learning rate of 8e-3.
         "fast_ppo": {
             "n_timesteps": 5e6, "learning_rate": 3e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
             "reward_scale": 1.0, "log_std_init": 0.5, "frames": 4, "actor": [64, 64], "critic": [128, 128],
             "first_layer_scale": 1.5,
         },
-        # Whole episodes, and more of them, did better in a trial than those of 5 s.
+        # In a trial, whole episodes, and more of them, did better than episodes of 5 s.
         "off_policy": {"gradient_steps": 2, "learning_rate": "lin_2e-3"},
         "td3": {"n_timesteps": 1.5e5},
         "sac": {"n_steps": 4, "n_timesteps": 1.5e5},
@@ -384,8 +385,9 @@ class Balance(_Bar):
 
     ## Rewards
 
-    Each step pays 1 - (e/0.35)²/2 - (s/S)²/2, taken at its end and before a kick; S = 0.5 m is half the
-    track. Inside the limits the reward lies between 0 and 1. With another `dt` rewards are scaled by dt/0.02.
+    Each step pays 1 - (e/0.35)²/2 - (s/S)²/2, evaluated at the end of the step and before a kick; S = 0.5 m
+    is half the track. Inside the limits the reward lies between 0 and 1. With another `dt` rewards are scaled
+    by dt/0.02.
 
     ## Starting State
 
@@ -421,8 +423,8 @@ class Balance(_Bar):
 
     ## Known Returns
 
-    The optimum is not known. Some kicks cannot be survived, so it lies below 500. docs/agents.md has the
-    estimate of value iteration for a far easier task.
+    The optimum is not known. Some kicks cannot be survived, so the optimum lies below 500. docs/agents.md has
+    the estimate of value iteration for a far easier task.
 
     ## Version History
 
@@ -487,8 +489,8 @@ class Balance(_Bar):
         },
     )
     difficulty = (
-        "The upright equilibrium is unstable, kicks come at random, and to push the bar back the support "
-        "must first move the wrong way: saving the bar uses up the track."
+        "The upright equilibrium is unstable, and kicks come at random. To push the bar back, the support "
+        "must first move the wrong way, so saving the bar uses up the track."
     )
     note = """
 The LQR is best, with weights tuned for the kicks; PPO is as good within the uncertainty of these episodes.
@@ -522,7 +524,7 @@ the bar in about the same number of episodes. SAC and TQC are a little worse, TD
         return (xp.abs(after.theta - math.pi) > self.largest_angle) | (xp.abs(after.s) > self.track)
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return how often the bar is balanced to the end."""
+        """Return how often the bar stays balanced to the end."""
         return {"episodes that last 10 s [%]": 100.0 * float((played.steps == self.limit).mean())}
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:

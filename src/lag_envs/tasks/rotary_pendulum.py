@@ -48,7 +48,7 @@ class RotarySwingUp(Task):
 
     ## Equations
 
-    A fast arm throws the pendulum outwards: the term with φ'² sin(2θ).
+    A fast arm throws the pendulum outwards; this is the term with φ'² sin(2θ).
 
     ## Signs and Units
 
@@ -138,7 +138,7 @@ class RotarySwingUp(Task):
         },
     )
     difficulty = (
-        "The motor is too weak to lift the pendulum in one go, and the faster arm and pendulum move, the "
+        "The motor is too weak to lift the pendulum in one go. The faster the arm and the pendulum move, the "
         "harder they push each other."
     )
     note = (
