@@ -103,7 +103,7 @@ UNTRACEABLE = {
     ),
     "equal": (
         {"potential": lambda self, q, xp: q.x**2 if self.spring == 0.0 else 0.0},
-        "potential; comparison; branch on a field that is no parameter",
+        "potential; comparison; branch on a field that is not a parameter",
     ),
     "is in": (
         {"potential": lambda self, q, xp: q.x**2 if self.spring in (0.0, 1.0) else 0.0},
@@ -111,11 +111,11 @@ UNTRACEABLE = {
     ),
     "table": (
         {"potential": lambda self, q, xp: {1.0: 2.0}.get(self.mass, 1.0) * q.x**2},
-        "potential; a look-up in a table; look up a field that is no parameter",
+        "potential; a look-up in a table; look up a field that is not a parameter",
     ),
     "cache": (
         {"potential": functools.cache(lambda self, q, xp: self.mass * q.x**2)},
-        "potential; cache; drop a cache",
+        "potential; cache; drop the cache",
     ),
     "type": (
         {"potential": lambda self, q, xp: q.x**2 if isinstance(self.mass, float) else 0.0},
@@ -143,7 +143,7 @@ UNTRACEABLE = {
     ),
     "truth": (
         {"potential": lambda self, q, xp: q.x**2 if self.friction else 0.0},
-        "potential; `if`; branch on a field that is no parameter",
+        "potential; `if`; branch on a field that is not a parameter",
     ),
     "logic": ({"potential": lambda self, q, xp: self.friction or q.x**2}, "potential; `if`"),
     "where": ({"potential": lambda self, q, xp: xp.where(True, q.x, 0.0)}, "potential; xp.where; smooth"),
@@ -359,7 +359,7 @@ DECLARED = {
     "keyword": ({"coordinates": {"x": "m", "lambda": "m"}}, "coordinates; 'lambda'; keyword"),
     "name that Python reads as another": (
         {"coordinates": {"x": "m", "\u00b5": "m"}},
-        "coordinates; Python reads '\u00b5' in a formula as '\u03bc', '\\u03bc'; write it so",
+        "coordinates; Python reads '\u00b5' in a formula as '\u03bc', '\\u03bc'; write it that way",
     ),
     "name with a blank": ({"coordinates": {"x": "m", "x 1": "m"}}, "coordinates; 'x 1'"),
     "name with an underscore first": ({"coordinates": {"x": "m", "_x": "m"}}, "coordinates; '_x'"),

@@ -384,7 +384,7 @@ def _guarded(function, x):
         ),
         (
             {"reward": lambda self, b, after, c, t, dt, xp: self.target["there"]},
-            "KeyError: 'there'; look up only what is there; state, controls and target are arguments",
+            "KeyError: 'there'; look up only names that exist; state, controls and target are arguments",
         ),
         (
             {"reward": lambda self, after: 0.0},
@@ -411,7 +411,7 @@ def _guarded(function, x):
         ({"reward": lambda self, *_: {"0.3": 1.0}.get(f"{self.scene.load_mass}", 0.0)}, "uses the text of"),
         (
             {"reward": lambda self, b, after, c, *_, last={"f": 0.0}: _difference(last, c.push)},
-            "uses a number of an earlier call; it must not keep numbers in a list",
+            "uses a number from an earlier call; formulas must not keep numbers in a list",
         ),
         (
             {"reward": lambda self, b, after, *_: _guarded(math.acos, after.x)},

@@ -5,11 +5,11 @@ coefficients, so that equal terms are merged and terms that cancel leave nothing
 of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
 an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Powers and
 products of sums that change with the motion are not expanded, except squares and products whose terms may
-combine with others (see `apart`). Besides the rules of sums and products there is one more: √x² = x. Those
-of sine and cosine are applied on request (`lag_envs.mechanics.identities`).
+combine with others (see `apart`). Besides the rules of sums and products there is one more rule: √x² = x. The
+rules of sine and cosine are applied on request (`lag_envs.mechanics.identities`).
 
-Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
-same bits in every process.
+Everything is ordered by its text, never by the time at which it was made, so the same formulas give the same
+code and the same bits in every process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Monomial = tuple[tuple["Atom", int], ...]
 
 #: A product of two sums that would have more terms than this stays a product.
 LARGEST_PRODUCT = 4096
-#: What to write instead of functions that formulas lack.
+#: What to write in place of functions that formulas do not have.
 INSTEAD = {
     "arcsin": "xp.atan(x / xp.sqrt(1 - x * x))",
     "arctan2": "xp.atan(y / x) where x is positive",
@@ -42,7 +42,7 @@ INSTEAD = {
 }
 INSTEAD |= {"asin": INSTEAD["arcsin"], "atan2": INSTEAD["arctan2"]}
 #: The remedy for a branch on a number.
-BRANCH = "where the form differs, branch on a field that is no parameter, such as `spring: bool = True`"
+BRANCH = "where the form differs, branch on a field that is not a parameter, such as `spring: bool = True`"
 
 
 _apart: ContextVar[bool] = ContextVar("apart", default=False)
@@ -52,8 +52,8 @@ _apart: ContextVar[bool] = ContextVar("apart", default=False)
 def apart(wanted: bool = True) -> Iterator[None]:
     """Keep squares and products of sums with sines and cosines as they are, within this context.
 
-    A kinetic energy is expanded, since cos² + sin² = 1 shortens it. Elsewhere, what depends on the distance
-    of two points that are close together would become a small difference of large numbers.
+    A kinetic energy is expanded, since cos² + sin² = 1 shortens it. In other formulas, expansion would turn a
+    quantity that depends on the distance of two nearby points into a small difference of large numbers.
     """
     token = _apart.set(wanted)
     try:
@@ -62,7 +62,7 @@ def apart(wanted: bool = True) -> Iterator[None]:
         _apart.reset(token)
 
 
-#: The errors so far of the formula that is run, which it may have caught.
+#: The errors raised so far by the formula that is being run, which the formula may have caught.
 raised: ContextVar[list[FormulaError] | None] = ContextVar("raised", default=None)
 
 
@@ -150,7 +150,7 @@ class Expr:
             return Expr({((value, 1),): 1})
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise FormulaError(
-                f"a formula combines a recorded number with {value!r}; it must be a real number"
+                f"a formula combines a recorded number with {value!r}, which is not a real number"
             )
         exact = _exact(value)
         return Expr({(): exact} if exact else {})
@@ -193,7 +193,7 @@ class Expr:
         return {a for monomial in self.terms for a, _ in monomial}
 
     def symbols(self) -> set[Atom]:
-        """Return all symbols, also those inside functions."""
+        """Return all symbols, including those inside functions."""
         found: set[Atom] = set()
         for atom in self.atoms():
             found |= {atom} if atom.argument is None else atom.argument.symbols()
@@ -271,8 +271,8 @@ class Expr:
     def _kept(self, exponent: int) -> Expr | None:
         """Return a power of this that is kept as it is, or None if the power is expanded.
 
-        (x - c)⁴ expanded would be a small difference of large numbers where x is near c. A factor that all
-        terms share is taken out first: (x v - c v)² is (x - c)² v².
+        If expanded, (x - c)⁴ would be a small difference of large numbers where x is near c. A factor that
+        all terms share is taken out first: (x v - c v)² is (x - c)² v².
         """
         if exponent < 2 or len(self.terms) < 2:
             return None
@@ -310,7 +310,7 @@ class Expr:
         return any(s.kind == "velocity" for s in self.symbols())
 
     def _is_apart(self) -> bool:
-        """Return whether only `apart` keeps the sum from being expanded."""
+        """Return whether `apart` is the only reason not to expand the sum."""
         with apart():
             stays = self._is_factor()
         return stays and not self._is_factor()
@@ -320,7 +320,7 @@ class Expr:
         return self._stays(2) and any(s.kind == "place" for s in self.symbols())
 
     def _ratio(self, other: Expr) -> int | Fraction | None:
-        """Return the number that gives this when `other` is multiplied by it, or None if there is none."""
+        """Return the number that times `other` gives this expression, or None if no number does."""
         if self.terms.keys() != other.terms.keys():
             return None
         ratios = {Fraction(c) / other.terms[monomial] for monomial, c in self.terms.items()}
@@ -349,7 +349,7 @@ class Expr:
         self._refuse("int()", "a formula must be smooth")
 
     def __index__(self) -> int:
-        self._refuse("an index or range", "only structural fields may count")
+        self._refuse("an index or range", "only structural fields can be counts")
 
     def __complex__(self) -> complex:
         self._refuse("complex()", "formulas are real")
@@ -364,7 +364,7 @@ class Expr:
     __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
 
     def __hash__(self) -> int:
-        remedy = "drop a cache; look up a field that is no parameter, such as `gear: int = 2`"
+        remedy = "drop the cache; look up a field that is not a parameter, such as `gear: int = 2`"
         self._refuse("a look-up in a table, set or cache", remedy)
 
     def __abs__(self) -> Expr:
@@ -381,7 +381,7 @@ class Expr:
     __floor__ = __ceil__ = __trunc__ = __round__
 
     def __iter__(self) -> Any:
-        self._refuse("a loop over the entries", "it is a single number")
+        self._refuse("a loop over the entries", "such a number has no entries")
 
     __array_priority__ = 1000.0
 
@@ -402,7 +402,7 @@ class Expr:
 def _scalar(value: Any) -> float:
     if getattr(value, "ndim", 0):
         raise FormulaError(
-            "a formula combines a recorded number with an array; it must return single numbers"
+            "a formula combines a recorded number with an array; a formula must return single numbers"
         )
     return float(value)
 
@@ -430,7 +430,7 @@ def _product(first: Monomial, second: Monomial) -> tuple[Monomial, Expr | None]:
 def _kept_product(first: Expr, second: Expr) -> Expr | None:
     """Return a product in which sums stay factors, or None if it is expanded.
 
-    (x - c - 1)(x - c + 1)(x - c - 2) expanded would be a small difference of large numbers, as a power would.
+    If expanded, (x - c - 1)(x - c + 1)(x - c - 2) would be a small difference of large numbers, like a power.
     Sums with velocities, and usually with sines or cosines, are expanded (see `Expr._stays`), unless the
     other operand already contains a power of the same sum. A sum of places stays a factor of velocities.
     """
@@ -460,14 +460,14 @@ def _kept_product(first: Expr, second: Expr) -> Expr | None:
 
 
 def _over_velocities(places: Expr, others: Expr) -> Expr | None:
-    """Return a sum of places times others with velocities, term by term, or None if they have none."""
+    """Return a sum of places times a sum with velocities, term by term, or None if there is no velocity."""
     if not others._has_velocity():
         return None
     return _expanded(_whole(places), others)
 
 
 def _whole(expr: Expr) -> Expr:
-    """Return a sum as a factor, without what all its terms share, if `apart` keeps it."""
+    """Return a sum as a factor, without the factors that all its terms share, if `apart` keeps it."""
     with apart():
         if not expr._is_factor():
             return expr
@@ -554,7 +554,7 @@ def _check_root(argument: Expr) -> None:
     if moving:
         raise FormulaError(
             f"xp.sqrt of the square {argument.text:.60} is an absolute value; an energy must be smooth: "
-            "write the number itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
+            "write the number itself if it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
         )
 
 
@@ -575,7 +575,7 @@ def _root(square: Expr) -> Expr | None:
         mixed = 2 * root * term
         opposite = any(square.terms.get(m, 0) == -d for m, d in mixed.terms.items())
         root = root - term if opposite else root + term
-    # An even power is kept apart from a square that comes by chance: only the whole decides.
+    # An even power must not be mistaken for a square that occurs by chance: only the whole decides.
     odd = any(n % 2 for monomial in root.terms for _, n in monomial) or len(root.terms) > 1
     return root if odd and _expanded(root, root).same(square) else None
 
@@ -649,7 +649,7 @@ def derivative(expr: Expr, symbol: Atom) -> Expr:
                     continue
             lower = ((atom, n - 1),) if n != 1 else ()
             rest = Expr({monomial[:i] + lower + monomial[i + 1 :]: c * n})
-            total = total + _expanded(rest, inner)  # so that terms of an equation can meet
+            total = total + _expanded(rest, inner)  # so that terms of an equation can combine
     return total
 
 

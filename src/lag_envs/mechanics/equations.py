@@ -52,7 +52,7 @@ class EquationsOfMotion:
     mass : dict
         Entries G_ij with i <= j, over all coordinates; those that vanish are left out.
     force : tuple of Expr
-        For each coordinate, all of its equation except Σ_j G_ij a_j, moved to the right-hand side.
+        For each coordinate, the whole equation except Σ_j G_ij a_j, moved to the right-hand side.
     """
 
     coordinates: tuple[str, ...]
@@ -116,7 +116,7 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
 
 
 def time_derivative(expr: Expr, names: Iterable[str]) -> Expr:
-    """Return Σ ∂e/∂q q', the time derivative as far as it comes from these places."""
+    """Return Σ ∂e/∂q q', the part of the time derivative that comes from these places."""
     total = Expr({})
     for name in names:
         total = total + derivative(expr, place(name)) * velocity(name)
@@ -130,14 +130,14 @@ def _check_velocities(kinetic: Expr) -> None:
             if (inside and not _is_power(atom, n)) or (atom.kind == "velocity" and n < 0):
                 what = atom.text if inside else f"1/{atom.name}"
                 raise FormulaError(
-                    f"kinetic has a velocity in a function or denominator: {what:.60}; it must be a "
+                    f"kinetic has a velocity in a function or denominator: {what:.60}; kinetic must be a "
                     "polynomial of degree two in the velocities"
                 )
         if _degree(monomial) > 2:
             text = Expr({monomial: 1}).text
             raise FormulaError(
-                f"kinetic is of degree {_degree(monomial)} in the velocities, in {text:.60}; it must be of "
-                "degree two at most"
+                f"kinetic has degree {_degree(monomial)} in the velocities, in {text:.60}; its degree must "
+                "be at most two"
             )
 
 
@@ -146,5 +146,5 @@ def _check_no_velocity(formula: str, expr: Expr) -> None:
         if symbol.kind == "velocity":
             raise FormulaError(
                 f"{formula} contains the velocity of {symbol.name!r}; only kinetic, dissipation and "
-                "applied may"
+                "applied may contain velocities"
             )

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 from lag_envs.mechanics.algebra import FormulaError
 
-#: What a control sets of a prescribed coordinate; ``"rest"`` if no control does.
+#: What a control sets of a prescribed coordinate; ``"rest"`` if no control sets anything.
 Level = Literal["acceleration", "rate", "place", "rest"]
 
 #: Other spellings of radians, which would not be taken for an angle, and degrees.
@@ -25,7 +25,7 @@ _ENDINGS: tuple[tuple[str, Level], ...] = (("_ddot", "acceleration"), ("_dot", "
 
 
 class Prescribed(NamedTuple):
-    """A coordinate that is moved, or held, from outside; one that rests has the control ``""``."""
+    """A coordinate that is moved or held from outside; a resting coordinate has the control ``""``."""
 
     name: str
     level: Level
@@ -103,10 +103,12 @@ def check_name(where: str, name: Any) -> str:
         or keyword.iskeyword(name)
         or name.startswith("_")
     ):
-        why = "a keyword of Python" if isinstance(name, str) and keyword.iskeyword(name) else "no name"
+        why = "a keyword of Python" if isinstance(name, str) and keyword.iskeyword(name) else "not a name"
         raise FormulaError(f"{where}: {name!r} is {why}; use letters, digits and _ as in q.theta_1")
-    if name != (read := unicodedata.normalize("NFKC", name)):  # many look alike: µ and μ, ϑ and θ
-        raise FormulaError(f"{where}: Python reads {name!r} in a formula as {read!r}, {read!a}; write it so")
+    if name != (read := unicodedata.normalize("NFKC", name)):  # many letters look alike: µ and μ, ϑ and θ
+        raise FormulaError(
+            f"{where}: Python reads {name!r} in a formula as {read!r}, {read!a}; write it that way"
+        )
     return name
 
 
@@ -121,7 +123,7 @@ def units(where: str, value: Any) -> dict[str, str]:
         angle = unit.partition("/")[0].strip().lower()
         if angle in _NOT_RAD or (angle == "rad" and not unit.startswith("rad")):
             raise FormulaError(
-                f"{where}: the unit of {name!r} is {unit!r}; write 'rad', as energies are written in radians"
+                f"{where}: the unit of {name!r} is {unit!r}; write 'rad', because energies use radians"
             )
     return dict(value)
 
@@ -174,8 +176,8 @@ def make_layout(
     if sorted(order) != sorted(entry.name for entry in kept):
         names = ", ".join(entry.name for entry in kept)
         raise FormulaError(
-            f"{of}.state must be an order of {names}, got {', '.join(order)}; "
-            "left_out names what it leaves out"
+            f"{of}.state must list {names} in some order, got {', '.join(order)}; "
+            "name entries that the state leaves out in left_out"
         )
     by_name = {entry.name: entry for entry in kept}
     if len(by_name) < len(kept):
@@ -206,14 +208,14 @@ def make_layout(
 def _check_clashes(of: str, free: dict, moved: dict, controls: Sequence[str]) -> None:
     both = [name for name in free if name in moved]
     if both:
-        raise FormulaError(f"{of}: {both[0]!r} is free and prescribed; it can be one of them")
+        raise FormulaError(f"{of}: {both[0]!r} is free and prescribed; a coordinate can only be one of these")
     names = {**free, **moved}
     for name in names:
         for ending in ("_dot", "_ddot"):
             if name + ending in names:
                 raise FormulaError(
                     f"{of}: the coordinate {name + ending!r} has the name of a derivative of {name!r}; "
-                    "name coordinates only, their rates follow"
+                    "declare coordinates only; their rates are named after them"
                 )
     for control in controls:
         for name in free:

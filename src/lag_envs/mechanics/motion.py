@@ -175,12 +175,12 @@ def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Colle
     found : Record
         Its formulas.
     varying : collection of str
-        Parameters that are not put in even if they are 0.
+        Parameters whose values are not put in even if they are 0.
 
     Raises
     ------
     FormulaError
-        If they are not valid energies, or need a coordinate that the state leaves out.
+        If the formulas are not valid energies, or need a coordinate that the state leaves out.
     """
     of = type(scene).__name__
     zero = {

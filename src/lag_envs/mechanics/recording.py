@@ -1,4 +1,4 @@
-"""Run a scene's formulas on recorded numbers, and refuse early what these cannot follow.
+"""Run a scene's formulas on recorded numbers, and refuse early what recorded numbers cannot follow.
 
 A formula runs on a twin of the scene: an object of the same class whose parameters are symbols, so that
 methods and properties that a formula calls see symbols too. Structural fields keep their values; formulas may
@@ -96,20 +96,20 @@ class Values:
         return len(self._items)
 
     def __setattr__(self, name: str, value: Any) -> NoReturn:
-        raise FormulaError(f"a formula sets the {self._what} {name!r}; it may only read")
+        raise FormulaError(f"a formula sets the {self._what} {name!r}; formulas may only read numbers")
 
     def __setitem__(self, index: Any, value: Any) -> NoReturn:
-        raise FormulaError(f"a formula sets the {self._what} {index!r}; it may only read")
+        raise FormulaError(f"a formula sets the {self._what} {index!r}; formulas may only read numbers")
 
     def __contains__(self, item: Any) -> NoReturn:
-        raise FormulaError(f"a formula asks what is `in` the {self._what}s; it cannot branch on numbers")
+        raise FormulaError(f"a formula uses `in` on the {self._what}s; formulas cannot branch on numbers")
 
     def __repr__(self) -> str:
         return f"<{self._what}s {', '.join(self._items)}>"
 
 
 def _others(names: Collection[str]) -> str:
-    """Return what there is besides a name that is missing."""
+    """Return a text with the names that exist, for an error about a missing name."""
     return f"only {', '.join(names)}" if names else "nor any other"
 
 
@@ -189,17 +189,17 @@ def formula(scene: Any, name: str, fields: Sequence[str] | None = None) -> Itera
     Parameters
     ----------
     scene : Scene or Task
-        Whose formula it is.
+        The scene or task to which the formula belongs.
     name : str
-        The formula, or a property or parameter that is computed.
+        The formula, or a computed property or parameter.
     fields : sequence of str, optional
-        The fields that it may use, for one that is not run on recorded numbers.
+        The fields that a formula may use, if it is not run on recorded numbers.
     """
     where, token = f"{type(scene).__name__}.{name}", raised.set([])
     try:
         yield
         for error in raised.get() or ():
-            raise FormulaError(f"{error}; the formula catches this error, which it must not")
+            raise FormulaError(f"{error}; the formula catches this error, which it must not do")
     except FormulaError as error:
         raise FormulaError(f"{where}: {error}") from error
     except dataclasses.FrozenInstanceError as error:
@@ -214,13 +214,13 @@ def formula(scene: Any, name: str, fields: Sequence[str] | None = None) -> Itera
 
 
 def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
-    """Return what to do about an error in a formula of a scene or task, or what it was computed from."""
+    """Return what to do about an error in a formula of a scene or task, or the fields that it was given."""
     if of_numpy := re.search(r"no callable (\w+) method", str(error)):  # np.exp of a recorded number
         return f"write xp.{of_numpy[1]}, and functions of xp only"
     if isinstance(error, RecursionError):
         return "a formula calls itself without end"
     if isinstance(error, KeyError):
-        return "look up only what is there; state, controls and target are arguments"
+        return "look up only names that exist; state, controls and target are arguments"
     if of_xp := re.search(r"Trace\.(\w+)\(\) missing", str(error)):
         return f"give xp.{of_xp[1]} all its arguments, as for NumPy's"
     owner = getattr(error, "obj", None)
@@ -260,7 +260,7 @@ def check_signature(scene: Any, name: str) -> None:
 
 
 def displaced(names: Sequence[str], wanted: Sequence[str]) -> bool:
-    """Return whether an argument has the name of one that belongs elsewhere."""
+    """Return whether an argument has the name of an argument in another position."""
     return any(name != other and name in wanted for name, other in zip(names, wanted, strict=False))
 
 
@@ -284,7 +284,7 @@ def record_scene(scene: Any, layout: SceneLayout) -> Record:
     Raises
     ------
     FormulaError
-        Naming class and formula, if one does something that recorded numbers cannot follow.
+        If a formula does something that recorded numbers cannot follow; the message names class and formula.
     """
     names = layout.names
     copy = symbolic_twin(scene)
@@ -328,8 +328,8 @@ def check_again(scene: Any, layout: SceneLayout, found: Record) -> None:
     again = record_scene(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
         raise FormulaError(
-            f"{type(scene).__name__}: a formula gives another result when it is run again; it may depend on "
-            "place, velocity, controls and fields only, not on time or chance"
+            f"{type(scene).__name__}: a formula gives another result when it is run again; formulas may "
+            "depend on place, velocity, controls and fields only, not on time or chance"
         )
 
 
@@ -370,7 +370,7 @@ def _check_controls(scene: Any, layout: SceneLayout, found: Record) -> None:
 
 
 def _check_dissipation(scene: Any, loss: Expr) -> None:
-    """Raise a FormulaError for a dissipation function that is none: without velocities, or a force."""
+    """Raise a FormulaError for a dissipation that has no velocities or acts as a constant force."""
     degrees = set()
     for monomial in loss.terms:
         moving = [(a, n) for a, n in monomial if any(s.kind == "velocity" for s in Expr.of(a).symbols())]

@@ -38,8 +38,7 @@ def layout_of(scene: Scene) -> SceneLayout:
 
 
 def structure_of(scene: Scene) -> tuple:
-    """Return everything that decides the code of a step; scenes with the same result differ only in
-    numbers."""
+    """Return everything that decides the code of a step; scenes that share it differ only in numbers."""
     cls, numbers = type(scene), parameter_names(scene)
     # Formulas are compared by identity, because keeping a formula that calls super() would keep its class
     # alive.
@@ -99,8 +98,7 @@ def undefined(scene: Scene) -> str:
 
 
 def _stepper(scene: Scene, lagged: bool) -> Any:
-    """Return what steps the scene: its normal form or the general series; a lagged step always uses the
-    series."""
+    """Return the scene's stepper: its normal form or the general series, always the series if lagged."""
     if lagged:
         from lag_envs.stepping.lag import lagged_stepper
 

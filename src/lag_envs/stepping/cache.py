@@ -1,9 +1,9 @@
 """Compiled functions on disk, one file each, checked before they are used.
 
 Numba's own cache trusts its files. A file that lost a byte to a full disk, a killed process or an editor
-causes an error deep inside pickle or LLVM, or runs as it is. Here a file begins with a key of what it was
-compiled from and a digest of its content. A file that does not match is dropped and compiled again. If the
-cache cannot be written to, nothing is kept.
+causes an error deep inside pickle or LLVM, or runs although it is damaged. Here a file begins with a key of
+what it was compiled from and a digest of its content. A file that does not match is dropped, and its function
+is compiled again. If the cache cannot be written to, nothing is kept.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _warned = False
 
 
 class Damaged(Exception):
-    """A file whose content is not what was written."""
+    """A file whose content differs from what was written."""
 
 
 class CacheFile(NamedTuple):
@@ -46,7 +46,7 @@ class CacheFile(NamedTuple):
 
 
 def folder() -> Path | None:
-    """Return the folder of compiled functions; None if there is none.
+    """Return the folder of compiled functions, or None if there is no such folder.
 
     It is ``lag_envs`` in the folder named by the environment variable ``NUMBA_CACHE_DIR``, or else in the
     system's cache folder of the user.
@@ -92,7 +92,7 @@ def trim(place: Path, limit: int) -> None:
 
 
 def damage(path: Path) -> str:
-    """Say what is wrong with a file of the cache; an empty string if nothing is."""
+    """Return what is wrong with a file of the cache, or an empty string if the file is intact."""
     try:
         return "" if _read(path, None) is not None else "it cannot be read"
     except Damaged as error:
@@ -117,11 +117,12 @@ def jit(function: Callable, key: str | None = None, inner: bool = False) -> Any:
     function : callable
         A function that Numba can compile.
     key : str, optional
-        What the result depends on: its own source, and all functions and numbers that it uses. By default the
-        file that defines the function, and the numbers that it uses. Types, machine, and the versions of
-        Python and Numba are added.
+        What the result depends on: its own source, and all functions and numbers that it uses. The default is
+        the file that defines the function, and the numbers that the function uses. Types, machine, and the
+        versions of Python and Numba are added.
     inner : bool, default False
-        Whether only compiled code calls it: it is then made without the code that takes Python's objects.
+        Whether only compiled code calls the function; it is then compiled without the code that takes
+        Python's objects.
 
     Returns
     -------
@@ -143,7 +144,7 @@ def jit(function: Callable, key: str | None = None, inner: bool = False) -> Any:
 
 
 class _DispatcherCache:
-    """A cache that a Numba dispatcher asks before it compiles, and tells after; see numba.core.caching."""
+    """The cache that a Numba dispatcher queries before compiling, and fills after; see numba.core.caching."""
 
     def __init__(self, name: str, key: str) -> None:
         self._name, self._key = re.sub(r"\W", "", name), key
@@ -195,7 +196,7 @@ def kept(name: str, parts: str, make: Callable[[], bytes]) -> bytes:
     name : str
         Their name in the cache.
     parts : str
-        Everything that they depend on.
+        Everything that the bytes depend on.
     make : callable
         Makes them if they are not in the cache.
     """
@@ -246,8 +247,8 @@ def _rebuild(content: bytes, target: Any) -> Any:
     from numba.core.compiler import CompileResult
     from numba.core.runtime import rtsys
 
-    # Loaded code needs Numba's memory system but no compiler. Preparing everything would take longer than all
-    # the rest. What a newer Numba needs is not known.
+    # Loaded code needs Numba's memory system but no compiler. Preparing the compiler too would take longer
+    # than all the rest. The needs of newer versions of Numba are not known.
     if tuple(map(int, __version__.split(".")[:2])) <= _KNOWN:
         rtsys.initialize(target)
     else:
@@ -284,7 +285,7 @@ def _read(path: Path, key: bytes | None) -> bytes | None:
 
 
 def _open_now(path: str, flags: int) -> int:
-    """Open without waiting: a pipe in a file's place must not hang."""
+    """Open a file without waiting, so that a pipe in its place cannot block."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
@@ -317,8 +318,8 @@ def _warn(path: Path, error: Damaged) -> None:
     if not _warned:
         _warned = True
         warnings.warn(
-            f"compiled code in {path} is damaged: {error}; it is dropped and compiled again. "
-            "`lag-envs cache` looks for more, `lag-envs cache --clear` drops all",
+            f"compiled code in {path} is damaged: {error}; the file is dropped and compiled again. "
+            "`lag-envs cache` checks all files, `lag-envs cache --clear` deletes them",
             RuntimeWarning,
             stacklevel=2,
         )

@@ -12,10 +12,12 @@ from lag_envs.stepping.target import Target
 if TYPE_CHECKING:
     from lag_envs.stepping.series import ExpansionStart, Factor, Series
 
-#: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
+#: Smaller sizes are replaced by this one; its unit is √(kg m²) m/s, or whatever follows from those of the
+#: mass matrix.
 SMALLEST_SIZE = 1e-12
-#: A part of a step may leave out this many tolerances of what its own terms sum up to. In stiff linear motion
-#: the terms of the whole step are many orders larger, and one tolerance of their sum allows anything.
+#: A part of a step may leave out this many tolerances, relative to the sum of its own terms. In stiff linear
+#: motion the terms of the whole step are many orders larger, and one tolerance of their sum would allow
+#: anything.
 PART_TOLERANCES = 30.0
 
 
@@ -113,9 +115,10 @@ class Certificate:
         return passed, self._bounds
 
     def factor(self) -> Any:
-        """Return what part of the step just checked will probably be certified, where it was not."""
+        """Return the part that will probably be certified of a step that has just failed the check."""
         t = self._t
-        # Bounds grow with the power N + 1 of the step. Where there are none, the last terms have to do.
+        # Bounds grow with the power N + 1 of the step. Where there are no bounds, the last terms serve in
+        # their place.
         bounds = terms = t.number(0.0)
         for i, (bound, root) in enumerate(zip(self._bounds, self._roots, strict=True)):
             slot = self._series.slot_of["v", i]
@@ -290,7 +293,7 @@ class Certificate:
         grown = t.select(
             t.less(b, t.number(0.5)), t.fma(t.number(2.0), b, t.number(1.0)), t.elementary("exp", z)
         )
-        # What has died out leaves nothing, over any time.
+        # An exponential that has died out leaves nothing, over any time.
         return t.select(t.less(t.number(0.0), last), t.mul(last, grown), last)
 
     def _tail_of_function(self, n: int, op: str, args: tuple[int, ...]) -> Any:

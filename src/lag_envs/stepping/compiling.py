@@ -15,8 +15,8 @@ from typing import Any
 
 from lag_envs.stepping.tracing import Trace, Value
 
-#: Lanes of a batch whose numbers lie together, as rows: few enough for the nearest cache, enough that the
-#: lanes that need further substeps fill vectors.
+#: Number of lanes of a batch whose numbers lie together, as rows: few enough for the nearest cache, and
+#: enough for the lanes that need further substeps to fill vectors.
 BLOCK = 192
 
 _BLOCK = "block_[0-9a-f]{16}"
@@ -28,7 +28,7 @@ def record_block(
 ) -> tuple[list[str], list[Value]]:
     """Return the code that computes a trace's outputs, as one call of a straight-line function.
 
-    Numba then need not infer the types inside, which would be most of the compile time.
+    Numba then need not infer the types inside, which would take most of the compile time.
     ``fused`` is passed on to `Trace.operations`.
 
     Returns
@@ -36,7 +36,7 @@ def record_block(
     lines : list of str
         The code.
     values : list of str or float
-        For each output its name, or the constant that it turned out to be.
+        For each output, its name or, if it turned out to be constant, its value.
     """
     operations, results = trace.operations(outputs.values(), fused=fused)
     made = {operation.name for operation in operations}
@@ -78,7 +78,7 @@ def compile_function(
     *helpers : callable
         Functions that the source calls, under their names there, as compiled by this function.
     inner : bool, default False
-        Whether only compiled code calls it, which saves compiling what Python would need.
+        Whether only compiled code calls the function, which saves compiling the code that Python would need.
     **constants : float or tuple of int
         Constants in the source.
 
@@ -90,7 +90,8 @@ def compile_function(
     Notes
     -----
     The name carries a digest of the source, the constants and the names of the helpers, which carry digests
-    of their own. So it covers everything that the compiled code depends on, and the cache uses it as the key.
+    of their own. The name therefore covers everything that the compiled code depends on, and the cache uses
+    it as the key.
     """
     from lag_envs.stepping import primitives
     from lag_envs.stepping.cache import jit
@@ -104,7 +105,7 @@ def compile_function(
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
     unique = f"{name}_{digest}"
     code = compile(source.replace(f"def {name}(", f"def {unique}(", 1), f"<{unique}>", "exec")
-    # A result may have turned out to be an infinite constant, or NaN.
+    # A result may turn out to be an infinite constant, or NaN.
     words = {"inf": math.inf, "nan": math.nan}
     namespace: dict[str, Any] = dict(primitives.NAMES, **words, **constants, __name__=__name__)
     namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}

@@ -1,4 +1,4 @@
-"""Whole control steps from attempts: substeps as the certificate asks for, one lane or a block of lanes.
+"""Whole control steps from attempts, in the substeps that the certificate requires, for one or many lanes.
 
 An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here
 it is repeated until the control step is over. In a block the lanes that are not done are gathered and go on
@@ -27,16 +27,16 @@ from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
 LARGEST_COUNT = 20_000
-#: So is one that would need a substep below this part of it.
+#: A control step that would need a substep below this part of it is refused too.
 SMALLEST_PART = 1e-9
-#: What the derivatives of a control step may leave out, relative to themselves.
+#: The largest part of the derivatives of a control step that may be left out.
 COMPLETE = 1e-13
 #: Last terms of derivatives below this part of them may be rounding errors.
 ROUNDED = 2e-15
-#: Steep functions. Their derivatives leave out far more than the motion. For reverse mode, their records are
-#: stepped with this part of the usual tolerance, and with so many terms more.
+#: Steep functions. Their derivatives leave out far more than the motion does. For reverse mode, records with
+#: such functions are stepped with this part of the usual tolerance, and with this many terms more.
 STEEP, STRICTER, FURTHER = {"atan", "tanh"}, 1e-3, 4
-#: A part of the control step that derivatives alone do not divide further.
+#: A part of the control step that is not divided further for the sake of derivatives alone.
 SHORT = 1e-6
 
 
@@ -137,7 +137,8 @@ def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE, fused: b
 def lanes(record: SeriesRecord) -> int:
     """Return how many lanes are stepped at once.
 
-    As many as one register holds, but at least four. Small series take two registers for each number.
+    This is the number that one register holds, but at least four. Small series take two registers for each
+    number.
     """
     doubles = registers().doubles
     return max(4, 2 * doubles if Series(record).slots < 8 else doubles)
@@ -173,7 +174,7 @@ def _enough(length, dt, left_out, order):  # type: ignore[no-untyped-def]
     The certificate does not cover derivatives: at rest a series has no terms, while those of its derivatives
     may be large. `left_out` estimates what they leave out, relative to themselves, from their last terms. All
     substeps of a step `dt` together may leave out `COMPLETE`, or each as much as it is rounded. NaN is no
-    reason for shorter ones: the caller refuses what is not finite.
+    reason for shorter substeps: the caller refuses results that are not finite.
     """
     if not (left_out > ROUNDED and left_out * dt > COMPLETE * length) or length < SHORT * dt:
         return np.inf
@@ -227,7 +228,7 @@ def _advance_tangent(rows, slopes, kept, sizes, dt, order):  # type: ignore[no-u
                     slopes[q + i] = rows[q + i]
                 for i in range(width):
                     sizes[i] = max(sizes[i], slopes[behind + width + i])
-                if longest < dt:  # what needed short substeps may be over
+                if longest < dt:  # the motion that needed short substeps may be over
                     longest = max(longest, next_length(used, dt, left_out, order))
         if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
             return -np.int64(rows[status])
@@ -280,8 +281,8 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
     """Take control steps, then the same substeps backwards.
 
     No substep is longer than its lane's entry of `longest`. Where that was too long for the derivatives, a
-    smaller one takes its place, or 0 if there were too many substeps. Then what was found for the lane is of
-    no use.
+    smaller one takes its place, or 0 if there were too many substeps. In that case the results for the lane
+    are of no use.
 
     Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
@@ -436,7 +437,7 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
-    width = max(4, registers().doubles)  # even small series take many numbers on the way back
+    width = max(4, registers().doubles)  # even small series need many numbers on the way back
     steep = any(node.op in STEEP for node in record.nodes)
     stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
     numbers = _numbers(record, TOLERANCE * stricter)

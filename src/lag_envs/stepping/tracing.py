@@ -7,9 +7,9 @@ every operation; the record then becomes one straight-line compiled function. Th
 * Equal operations are recorded once, and operations on constants are evaluated at once.
 * ``a * b + c`` becomes one fused multiply-add if the product is used nowhere else. The fusion is thus
   chosen here and not by the compiler, so that one environment and ten thousand give the same bits.
-* A zero term is dropped. Only here is it decided which terms a scene pays for: a coefficient that a scene
-  does not have is returned as ``0.0``, a parameter that is zero is known to be zero (`Trace.zero`), and
-  neither leaves any compiled code.
+* A zero term is dropped. This alone decides which terms a scene pays for: a coefficient that a scene does not
+have is returned as ``0.0``, a parameter that is zero is known to be zero (`Trace.zero`), and neither leaves
+any compiled code.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ IEEE: dict[str, Callable] = _FLOAT | {
     "c-a*b": lambda a, b, c: _fma(-a, b, c),
 }
 
-#: What a sum becomes if its first or its second term is a product that is used nowhere else.
+#: The operation that a sum becomes if its first or second term is a product that is used nowhere else.
 FUSED = {"+": ("a*b+c", "a*b+c"), "-": ("a*b-c", "c-a*b")}
 BOOLEAN = frozenset({"<", "<=", "&", "|", "~"})
 #: Operations that take truth values.
@@ -163,8 +163,8 @@ class TracedNumber:
 
     def __eq__(self, other: object) -> NoReturn:
         raise FormulaError(
-            "a recorded number is compared by ==, != or in, which rounding decides; use < and <=, or branch "
-            "on a field that is no parameter"
+            "a recorded number is compared by ==, != or in, whose result depends on rounding; use < and <=, "
+            "or branch on a field that is not a parameter"
         )
 
     __ne__ = __eq__
@@ -172,40 +172,40 @@ class TracedNumber:
     def __hash__(self) -> NoReturn:
         raise FormulaError(
             "a recorded number is looked up in a table, set or cache; use xp.where, or look up a field that "
-            "is no parameter"
+            "is not a parameter"
         )
 
     def __str__(self) -> str:
-        raise FormulaError("a formula uses the text of a recorded number, which stands for any number")
+        raise FormulaError("a formula uses the text of a recorded number, which has no fixed value")
 
     def __mod__(self, other: Any) -> NoReturn:
         raise FormulaError(
-            "a formula that is compiled has no %, // or divmod(); a % b is a - b * xp.floor(a / b)"
+            "a compiled formula has no %, // or divmod(); for a % b write a - b * xp.floor(a / b)"
         )
 
     __rmod__ = __floordiv__ = __rfloordiv__ = __divmod__ = __rdivmod__ = __mod__
 
     def __round__(self, digits: Any = None) -> NoReturn:
-        raise FormulaError("a formula that is compiled has no round(); write xp.floor(x + 0.5)")
+        raise FormulaError("a compiled formula has no round(); write xp.floor(x + 0.5)")
 
     __floor__ = __ceil__ = __trunc__ = __int__ = __index__ = __round__
 
     def __bool__(self) -> bool:
         raise FormulaError(
-            "a formula that is compiled cannot branch on its numbers with if, and, or, min or max; "
+            "a compiled formula cannot branch on its numbers with if, and, or, min or max; "
             "use xp.where, &, |, xp.minimum and xp.maximum"
         )
 
 
 def is_truth(value: Any) -> bool:
-    """Return whether a recorded value is true or false, and no number."""
+    """Return whether a recorded value is a truth value rather than a number."""
     if not isinstance(value, TracedNumber):
         return isinstance(value, bool)
     return value.op in BOOLEAN or (value.op == "where" and is_truth(value.args[1]))
 
 
 class Trace:
-    """One recording: inputs, operations, and the code they make.
+    """A recording: inputs, operations, and the code made from them.
 
     A trace is also the ``xp`` namespace of traced formulas: ``xp.where`` means `numpy.where` on arrays and a
     recorded selection here.
@@ -242,8 +242,8 @@ class Trace:
             return _FLOAT[op](*args)
         if any(a.trace is not self for a in given):
             raise FormulaError(
-                "a formula uses a number of an earlier call; it must not keep numbers in a list, a dict or "
-                "an attribute: the state before the step is `before`, and nothing else is remembered"
+                "a formula uses a number from an earlier call; formulas must not keep numbers in a list, a "
+                "dict or an attribute: the state before the step is `before`, and nothing else is remembered"
             )
         args = self._as_numbers(op, args)
         simple = _simplify(op, args)
@@ -269,8 +269,8 @@ class Trace:
             return args
         if all(truths):
             raise TypeError(
-                f"{op} is applied to comparisons alone; join them with | and &, or count one by "
-                "xp.where(condition, 1.0, 0.0)"
+                f"{op} is applied to comparisons alone; join comparisons with | and &, or turn them into "
+                "numbers with xp.where(condition, 1.0, 0.0)"
             )
         counted = (self.where(a, 1.0, 0.0) if t else a for a, t in zip(others, truths, strict=True))
         return *conditions, *counted
@@ -281,9 +281,9 @@ class Trace:
     def zero(self) -> TracedNumber:
         """Return a number known to be zero.
 
-        Its terms are dropped, like those of a literal 0.0, but only after products have been fused. So the
-        other terms round as they would if it were not zero, and environments with and without, say, damping
-        get the same bits in one batch.
+        Its terms are dropped, like those of a literal 0.0, but only after products have been fused. Therefore
+        the other terms round as they would if the number were not zero, and in one batch, environments with
+        and without, say, damping get the same bits.
         """
         number = TracedNumber(self, f"zero{len(self._zeros)}")
         self._zeros.add(number.name)
@@ -409,7 +409,7 @@ def sum_of_products(factors: Iterable[tuple[Any, Any]]) -> Any:
 
 
 def pairwise_sum(terms: Sequence[Any]) -> Any:
-    """Sum neighbours, then neighbouring sums, and so on: a short chain, and few roundings on the way.
+    """Sum neighbours, then neighbouring sums, and so on, which makes a short chain with few roundings.
 
     Examples
     --------

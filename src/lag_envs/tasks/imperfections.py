@@ -216,9 +216,7 @@ def _seconds(keyword: str, value: Any, dt: float) -> float:
     """Return a delay in control steps."""
     delay = check_number(keyword, value, "s")
     if not 0.0 <= delay:
-        raise ValueError(
-            f"{keyword} must be at least 0 s, got {delay:g} s: a delay cannot be negative"
-        )
+        raise ValueError(f"{keyword} must be at least 0 s, got {delay:g} s: a delay cannot be negative")
     steps = delay / dt
     if abs(steps - round(steps)) <= _WHOLE:
         steps = float(round(steps))
@@ -333,9 +331,7 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
     if name not in (numbers := parameter_names(scene)):
         known = [*inspect.signature(type(scene)).parameters, "dt", "duration", "target"]
         why = "it decides how the environment is built" if name in known else "there is no such parameter"
-        raise ValueError(
-            f"{where}: this cannot be drawn, because {why}; choose from {', '.join(numbers)}"
-        )
+        raise ValueError(f"{where}: this cannot be drawn, because {why}; choose from {', '.join(numbers)}")
     if not isinstance(given, Sequence) or isinstance(given, str) or len(given) < 2:
         raise ValueError(
             f'{where} must be (low, high), optionally followed by "log" and "absolute", got {shown(given)}'
