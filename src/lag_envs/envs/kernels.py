@@ -2,9 +2,9 @@
 
 The text consists of a task's script (`lag_envs.envs.scripted`), printed in C++, and of two kernels around it.
 ``begin`` starts episodes. ``step`` takes a control step: control, guard, motion in certified substeps,
-reward, ending, kick, observation, and the start of the next episode if one is over. One thread computes each
-environment, from that environment's numbers only. Without a GPU's compiler the kernels are loops over the
-environments.
+reward, ending, kick, observation, and the start of the next episode if one is over. Each environment is
+computed by one thread, from this environment's numbers only. Without a GPU's compiler the kernels are loops
+over the environments.
 
 In double precision, compiled without contraction of products and sums, all bits agree with
 `lag_envs.envs.unfused.Unfused`. Single precision uses the functions of C's library, and series that are only
@@ -20,7 +20,7 @@ from lag_envs.stepping import primitives
 from lag_envs.stepping.script import CPP, CPP_SINGLE
 from lag_envs.tasks.base import Task
 
-#: Flags that keep products and sums apart, when all bits matter: for NVRTC, and for processors' compilers.
+#: Flags that keep products and sums apart when all bits matter, for NVRTC and for processors' compilers.
 APART = ("--fmad=false", "-ffp-contract=off")
 
 _HEAD = """\

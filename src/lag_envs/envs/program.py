@@ -1,7 +1,7 @@
 """From a task to compiled functions: one program for the single and for the vector environment.
 
 A program records the formulas of a task and its scene as lines of code and prints them into a few functions.
-All follow one order within a step: control, held step, reward and ending, kick, observation.
+All functions follow one order within a step: control, held step, reward and ending, kick, observation.
 
 The memory of one environment is a column of numbers, its rows. Rows kept from step to step: lifted state
 ``y``, target ``g`` if there is one, control ``u``, steps taken ``n`` (in a batch, once the episode is over,
@@ -11,8 +11,8 @@ instead of a step), observation ``o``.
 
 A batch is cut into blocks of `BLOCK` environments. The rows of a block lie one after another at distances
 known at compile time, so the compiler sees that they do not overlap and turns the loop over a block into
-vector instructions; with one array per row it fails to prove that. Rows needed only within a step exist once
-for all blocks and so stay in the processor's nearest cache.
+vector instructions; with one array per row it fails to prove this. Rows needed only within a step exist once
+for all blocks and therefore stay in the processor's nearest cache.
 """
 
 from __future__ import annotations
@@ -72,22 +72,22 @@ class Program:
     task : Task
         Its class, its scene's class and its control decide the code; its numbers do not.
     absent : frozenset of str
-        Constants that are zero in every environment of the program: they leave no code.
+        Constants that are zero in every environment of the program; they leave no code.
     varying : frozenset of str
         Constants that differ within a batch; they become rows.
     names : sequence of str, optional
         All constants; by default those of the task.
     """
 
-    #: Further rows that are kept, and those of them and of the constants that are set at an episode's start.
+    #: Further rows that are kept, and the rows and constants that are set at an episode's start.
     own: Sequence[str] = ()
     drawn: Sequence[str] = ()
-    #: Those of its own rows that a step replaces once it is accepted, and the names of their new values.
+    #: The rows of its own that a step replaces once the step is accepted, and the names of their new values.
     reached: Sequence[str] = ()
     reaching: Sequence[str] = ()
     #: Further rows needed within a step.
     passing: Sequence[str] = ()
-    #: Whether a batch has a loop after the step for what the sensors show.
+    #: Whether a batch has a loop after the step for the readings of the sensors.
     sensing = False
     #: Where actuators lag: names of the controls in force at a step's start and end, which the rows ``u``
     #: keep between steps, and of their means, which rewards use. Within a step ``u`` are the commands, until
@@ -412,7 +412,8 @@ class Program:
         key = [self._key] if self.kick else []
         ends = list(zip(self.in_force, self.in_force_after, strict=True))
         refused = [*self._load(self.held, self.asked), *self._store(self.asked)] if self.asked else []
-        # If the fast formula does not hold, or the last reward is special, the start is kept for another try.
+        # If the fast formula does not hold, or the last reward is special, the start is kept for a second
+        # attempt.
         holds = "within and not over > 0.0" if self.last else "within"
         main = [
             *inputs, *self._to_end,

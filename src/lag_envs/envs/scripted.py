@@ -11,7 +11,7 @@ environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 =================  ==========================================================================================
 ``derive(k)``      computes the constants that follow from the given ones, after one of these was changed
 ``start(f, d, k)`` sets an episode's start, from one draw for each entry of state and target
-``lift(f, k)``     computes what the formulas need besides the state: call it after setting the state by hand
+``lift(f, k)``     computes what the formulas need besides the state; call it after setting the state by hand
 ``move(f, a, k)``  takes a step: control, motion, reward, ending
 ``kick(f, d, k)``  applies the random kick after the step
 ``observe(f, k)``  computes the observation
@@ -25,7 +25,7 @@ With hidden parameters or noisy sensors there are two more (`UnfusedImperfectPro
 ``sense(f, d, k)`` turns the true observation into the one that the sensors show
 =================  ==========================================================================================
 
-The caller keeps actions that take effect later.
+The caller stores actions that take effect later.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class ScriptRows(NamedTuple):
     turned : slice
         Places that the state leaves out, for the picture.
     reward, ended, refused : int
-        Of the last step; the latter two are 1.0 or 0.0.
+        Results of the last step; the latter two are 1.0 or 0.0.
     """
 
     y: slice
@@ -385,8 +385,8 @@ class UnfusedProgram:
             return [x for pose in found.values() for x in pose]
 
         given = [self._read(t, part) for part in (slice(0, n), rows.g, rows.u, rows.turned)]
-        # If the poses do more than arithmetic with the parameters, these stay fixed; if with the state, there
-        # is no picture.
+        # If the poses do more than arithmetic with the parameters, the parameters stay fixed. If they do more
+        # with the state, there is no picture.
         for own in (True, False):
             try:
                 self._write(t, 0, self._run(t, partial(poses, own), *given), "p")

@@ -2,9 +2,9 @@
 
 The thread that leads a step opens a turn, identified by its number. The leader and helpers claim blocks of
 environments, each starting from its own place, so that a block mostly stays in the cache of one core. An
-environment's bits do not depend on who steps it, or when. The leader waits only for claimed blocks: a helper
-that comes late, or never, costs only its help, and one that comes after the turn finds every block claimed.
-So nothing hangs or goes wrong if a thread is missing after a fork.
+environment's bits do not depend on who steps it, or when. The leader waits only for claimed blocks. A helper
+that comes late, or never, therefore costs only its help, and a helper that comes after the turn finds every
+block claimed. Nothing hangs or goes wrong if a thread is missing after a fork.
 
 Python threads suffice, since compiled code does not hold the interpreter's lock. They are started when first
 needed, and ended before a process forks.
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from lag_envs.host import usable_cores
 from lag_envs.stepping.compiling import BLOCK, compile_python
 
-#: Environments per thread, by default: fewer would be stepped before another thread is awake.
+#: Environments per thread, by default: fewer environments would be stepped before another thread is awake.
 SHARE = 4096
 #: How often a thread checks whether another is ready, about 50 µs in total, before it sleeps.
 PATIENCE = 200_000
@@ -44,12 +44,12 @@ STEP_BLOCKS = (
 
 
 def words(blocks: int) -> int:
-    """Return how many numbers threads share."""
+    """Return the number of numbers that threads share."""
     return WORDS + 2 * blocks
 
 
 def write_places(ids: NDArray[np.uint64], count: int, kept: Sequence[str]) -> None:
-    """Write into a batch's keys where its rows lie."""
+    """Write the places of a batch's rows into its keys."""
     ids[3 * count + 10 : 3 * count + 12] = len(kept) * BLOCK, kept.index("n") * BLOCK
 
 
@@ -71,7 +71,7 @@ def _step_all(  # type: ignore[no-untyped-def]
         mine = at + np.uint64(WORDS) + blocks + np.uint64(share)
         if not atomic_replace(ids, mine, np.uint64(0), np.uint64(1)):
             return 0, 0  # another helper is still waiting for the next turn, with this `par`
-        # Waking costs much of a turn, so a helper also takes part in turns that follow soon.
+        # Waking takes much of a turn's time, so a helper also takes part in turns that follow soon.
         while opened(ids, at, now):
             now = atomic_load(ids, at)
             if ids[at + np.uint64(9)] != np.uint64(action.itemsize):
@@ -195,7 +195,8 @@ def compile_step_all() -> Callable:
     refused and kept its state; or -(i + 1) if action i is not finite, in which case nothing was stepped.
     ``over`` counts the environments whose episode has just ended; it is -1 if helpers are not done yet, and
     then the same call has to be made again. Helpers make this call with another number below `shares` and the
-    `par` that belongs to it; they continue with steps that follow soon. Their results mean nothing.
+    `par` that belongs to it; they continue with steps that follow soon. The results of these calls mean
+    nothing.
     """
     from lag_envs.stepping.primitives import at_address
 
@@ -227,8 +228,9 @@ def address_of(step_blocks: Any, *arrays: NDArray) -> int:
 def default_threads(count: int) -> int:
     """Return the default number of threads for a batch of this size.
 
-    One for each `SHARE` environments and for each core that this process may use, but no more than
-    ``OMP_NUM_THREADS``, which Ray and others set for their workers. In a process of `multiprocessing`, one.
+    There is one thread for each `SHARE` environments and at most one for each core that this process may use,
+    but no more than ``OMP_NUM_THREADS``, which Ray and others set for their workers. In a process of
+    `multiprocessing` there is one thread.
     """
     if count < 2 * SHARE or multiprocessing.parent_process() is not None:
         return 1
@@ -249,7 +251,7 @@ def offer(calls: Sequence[tuple], kind: np.dtype) -> None:
         return
     if id(calls) == _offered and _offers.qsize() >= len(calls):
         return
-    _offered = id(calls)  # not the calls themselves, which keep a batch's memory
+    _offered = id(calls)  # the calls themselves are not stored, since they would keep a batch's memory
     with contextlib.suppress(queue.Empty):
         while _offers.get_nowait() is not None:
             pass
@@ -269,7 +271,7 @@ def _help() -> None:
 
 
 def _dismiss() -> None:
-    """End the helpers: a thread does not survive a fork."""
+    """End the helpers, because a thread does not survive a fork."""
     for _ in _helpers:
         _offers.put(None)
     while _helpers:

@@ -23,7 +23,8 @@ from lag_envs.stepping.compiling import compile_lines, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import BOOLEAN, Operation, Trace, TracedNumber
 
-#: Lanes whose numbers lie together: few enough that all inputs and outputs fit into the nearest cache.
+#: Number of lanes whose numbers lie together: few enough that all inputs and outputs fit into the nearest
+#: cache.
 LANES = 64
 
 
@@ -52,10 +53,10 @@ class Differentiable(Trace):
         outputs : sequence of number
             The numbers to differentiate.
         seeds : sequence of number
-            One for each output, its cotangent.
+            The cotangent of each output.
         inputs : sequence of TracedNumber
             The numbers to differentiate with respect to. Results of earlier operations count as independent
-            inputs: nothing is passed on to what they were computed from.
+            inputs: nothing is passed on to the numbers from which they were computed.
         """
         total: dict[str, Any] = {}
 
@@ -73,7 +74,8 @@ class Differentiable(Trace):
                 continue
             for operand, amount in self._shares(node, seed):
                 if node.name in branches and node.op not in ("+", "-", "neg", "where"):
-                    # What is not taken gets exactly 0, even if its own slope is infinite. NaN is passed on.
+                    # A branch that is not taken gets exactly 0, even if its own slope is infinite. NaN is
+                    # passed on.
                     amount = self.where(self.abs(seed) <= 0.0, 0.0, amount)
                 pass_on(operand, amount)
         return [total.get(x.name, 0.0) if isinstance(x, TracedNumber) else 0.0 for x in inputs]
@@ -111,7 +113,7 @@ class Differentiable(Trace):
 
     @staticmethod
     def _branches(nodes: Sequence[TracedNumber]) -> set[str]:
-        """Return the operations that lead into branches of a selection: their numbers may be anything."""
+        """Return the operations that lead into branches of a selection; their numbers may be anything."""
         found: set[str] = set()
         for node in reversed(nodes):
             operands = node.args[1:] if node.op == "where" else node.args if node.name in found else ()
@@ -184,7 +186,7 @@ class LaneFormula:
             f"    size = min(np.uint64({LANES}), count - first)",
             *_loops(zip(into, columns.values(), strict=True)),
             "    for i in range(size):",
-            *(f"        {line}" for line in work or ["pass"]),  # a step without controls has none to compute
+            *(f"        {line}" for line in work or ["pass"]),  # there may be no controls to compute
             *_loops(zip(places, out, strict=True)),
         ]
         self._compiled: Any = compile_lines(name, ", ".join([*arrays[0], *arrays[1], "numbers"]), body)
@@ -201,7 +203,7 @@ class LaneFormula:
         *given : ndarray, shape (lanes, columns)
             Numbers of float64 or float32, with any strides.
         out : sequence of ndarray, optional
-            Where results are to be written.
+            Arrays into which results are written.
         """
         found = [np.empty((n, len(given[0]))).T for n in self._sizes] if out is None else list(out)
         kinds = tuple(x.dtype.char for x in given)

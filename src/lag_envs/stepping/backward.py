@@ -1,16 +1,17 @@
-"""The step of `lag_envs.stepping.series` backwards: from the gradient at its end to that at its start.
+"""The step of `lag_envs.stepping.series` backwards, from the gradient at its end to that at its start.
 
 A small change of the motion obeys M δa = δF - δM a. So the cotangents μ of places and ν of velocities, with
 M σ = ν and g = σᵀ(F - M a), obey the adjoint equation::
 
     dμ/dt = -∂g/∂q,     dν/dt = -μ - ∂g/∂v
 
-whose derivatives are taken with σ and a held fixed. It starts at the end of a substep and goes back in time,
-so both series are expanded there: that of the motion first, then that of the cotangents, order by order. The
-derivatives of g follow node by node from the last to the first. A product z = x y adds the series z̄ y to x̄
-and z̄ x to ȳ; a function with z' = w x' adds z̄ w. So an order costs at most two sums of products where the
-series of the motion has one. The gradient with respect to a weight w is the integral of ∂g/∂w. All these
-series show by their own terms what they leave out. The lengths of the substeps are held fixed.
+whose derivatives are taken with σ and a held fixed. The integration starts at the end of a substep and goes
+back in time, so both series are expanded at that end: first the series of the motion, then that of the
+cotangents, order by order. The derivatives of g follow node by node from the last to the first. A product z =
+x y adds the series z̄ y to x̄ and z̄ x to ȳ; a function with z' = w x' adds z̄ w. Therefore an order costs at
+most two sums of products where the series of the motion has one. The gradient with respect to a weight w is
+the integral of ∂g/∂w. The terms of all these series show how much the series leave out. The lengths of the
+substeps are held fixed.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ class Backward(Series):
     record : SeriesRecord
         What is stepped, made with tangents.
     sources : tuple of str
-        Names in the record's tangents: gradients are with respect to them, places and velocities.
+        Names in the record's tangents; gradients are taken with respect to these, places and velocities.
     """
 
     def __init__(self, record: SeriesRecord, sources: tuple[str, ...]) -> None:
         self._sources = sources
-        #: Weights that sources change.
+        #: Weights that depend on sources.
         self._active = [
             name for name, slopes in record.tangents.items() if any(source in sources for source in slopes)
         ]
@@ -61,19 +62,19 @@ class Backward(Series):
 
     @property
     def entries(self) -> int:
-        """How many coefficients a lane needs."""
+        """The number of coefficients that a lane needs."""
         return STRIDE * self.slots
 
     # --- which series are kept -----------------------------------------------------------------------------
 
     def _find_live(self) -> list[int]:
-        """Return the nodes whose series are kept, here also those that active weights multiply."""
+        """Return the nodes whose series are kept, including those that active weights multiply."""
         sums = [node for n in self._find_reached() if (node := self.record.nodes[n]).op == "sum"]
         pairs = [pair for node in sums for pair in zip(node.args, node.weights, strict=False)]
         return sorted({*super()._find_live(), *(a for a, weight in pairs if weight in self._active)})
 
     def _find_reached(self) -> list[int]:
-        """Return the nodes that g depends on, also through the arguments of functions."""
+        """Return the nodes that g depends on, including the arguments of functions."""
         return self._reach(lambda args: args[:1])
 
     def _plan_back(self, n: int, node: Node) -> None:
@@ -120,7 +121,7 @@ class Backward(Series):
         tolerance: Any,
         bars: Sequence,
     ) -> tuple[StepProgress, list, Any]:
-        """Take a substep like `substep`; in lanes where it ends the control step, also take it backwards.
+        """Take a substep like `substep`; in lanes where this ends the control step, also take it backwards.
 
         Parameters
         ----------
@@ -140,8 +141,8 @@ class Backward(Series):
             Cotangents before the substep in lanes that went backwards, with those of the sources added up;
             then an estimate of what they leave out, relative to them.
         back : condition
-            Whether lanes that ended their control step went backwards. They do not if they are only a few of
-            the lanes of a vector.
+            Whether lanes that ended their control step went backwards. They do not go backwards if they are
+            only a few of the lanes of a vector.
         """
         zero, again, n = t.number(0.0), t.less(tolerance, t.number(0.0)), self.size
         wanted = t.both(t.negated(again), t.less(zero, lane.left))
@@ -353,7 +354,7 @@ class Backward(Series):
 
 
 class _Order:
-    """What an order gives, while it is computed.
+    """The results of an order while it is computed.
 
     Attributes
     ----------

@@ -2,9 +2,9 @@
 
 A dual number is a value with one derivative per column; None stands for derivatives that are all zero.
 `DualTarget` makes a target of such numbers from two targets: one of plain numbers, and one whose numbers are
-vectors with an entry per column. So each recurrence is written once, and all columns share its operations. It
-supports what `Series.expand` and `Series.advance` need, but not the certificate: comparisons have no
-derivative.
+vectors with an entry per column. Therefore each recurrence is written once, and all columns share its
+operations. `DualTarget` supports what `Series.expand` and `Series.advance` need, but not the certificate,
+because comparisons have no derivative.
 """
 
 from __future__ import annotations

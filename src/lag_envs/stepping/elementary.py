@@ -25,7 +25,7 @@ from typing import Any
 
 from lag_envs.stepping.tracing import MAGIC, Trace, polynomial
 
-#: `sincos` is accurate up to this angle [rad]; beyond, it gives NaN.
+#: `sincos` is accurate up to this angle [rad]; beyond this angle it gives NaN.
 LARGEST_ANGLE = 2.6e7
 
 # pi/2 in parts: three of 29 bits, whose multiples by integers up to 2^24 are exact; then the rest.
@@ -145,7 +145,7 @@ def tanh(x: Any, xp: Any) -> Any:
 
 def log(x: Any, xp: Any) -> Any:
     """Return the natural logarithm."""
-    # Scale numbers away from both ends of the range; then x = 2**k m with √½ <= m < √2.
+    # Numbers are scaled away from both ends of the range; then x = 2**k m with √½ <= m < √2.
     below = x < 1.0
     y = x * xp.where(below, 2.0**60, 2.0**-60)
     n = xp.exponent(y * math.sqrt(0.5))

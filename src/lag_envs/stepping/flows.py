@@ -135,7 +135,7 @@ def section(
     lines : list of str
         The code.
     values : list of str or float
-        For each output its name, or its value if it turned out to be constant.
+        For each output, its name, or its value if it turned out to be constant.
     """
     trace = kind()
     results = formula(trace, *(_input(trace, i) for i in inputs))
@@ -223,7 +223,7 @@ class Stepper:
         if isinstance(condition, bool):
             tested = [f"within = {condition}"]
 
-        #: An ordinary step, without branches; ``within`` tells whether the step was ordinary.
+        #: The lines of an ordinary step, without branches; ``within`` tells whether the step was ordinary.
         self.fast = [*prepared, *tested, *moved, *finished]
         by_name = dict(zip(flow.coefficients._fields, values[flow.size :], strict=True))
         left_out = frozenset(name for name, value in by_name.items() if isinstance(value, float))
@@ -232,7 +232,7 @@ class Stepper:
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
         #: The lines of any step.
         self.any_step = [*prepared, call, *finished]
-        #: Returns the function that these lines call.
+        #: A function that returns the function that these lines call.
         self.engine = lambda: flow.compile(left_out)
         self._tangent = lambda by: flow.compile_tangent(left_out, by)
         self._given, self._prepare, self._finish, self._form = given, prepare, finish, form
@@ -344,7 +344,7 @@ class Stepper:
         form, flow, angle = self._form, self.flow, self._angle
         lifted = state if angle is None else [*state, xp.cos(state[angle]), xp.sin(state[angle])]
         variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
-        # The end is linear in the moved variables, so their values are not needed.
+        # The end is linear in the moved variables, so the values of these variables are not needed.
         moved = xp.inputs("moved0", "moved1")
         ends = form.pack([*moved, *variables[2:]], lifted, u, k.dt, k)[: self._n_state]
         *bars, direct = split_lengths(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)

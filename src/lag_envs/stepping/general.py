@@ -1,8 +1,8 @@
 """One control step of any scene: from its state to the series' variables, the series, and back.
 
 A control that sets the acceleration of a prescribed coordinate moves it exactly. If it sets the rate instead,
-velocities jump when the rate is switched, and the state holds w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is
-converted at both ends of the control step.
+velocities jump when the rate is switched, and the state holds w = v + M⁻¹ Σ_m G_m ṡ_m in place of the
+velocities; w is converted at both ends of the control step.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ class SeriesStepper:
         given = self._state(y)
         known = {f"start_{name}": value for name, value in given.items()} | self._inputs(xp, u)
         inputs = {name: known[name] for name in self._whole.inputs if name in known}
-        q = [given.get(name, 0.0) for name in self._layout.free]  # if one is left out, nothing depends on it
+        q = [
+            given.get(name, 0.0) for name in self._layout.free
+        ]  # places left out do not matter
         driven = {p.name: given.get(p.name) for p in self._layout.prescribed}
         shift = self._shift(xp, q, driven, self._starting(xp, u), k)
         for i, name in enumerate(self._layout.free):
@@ -182,7 +184,7 @@ class SeriesStepper:
     # --- derivatives ---------------------------------------------------------------------------------------
 
     def tangent(self, parameters: Mapping[str, float], by: tuple[str, ...] = ()) -> SeriesTangent:
-        """Return the differentiated step of a scene with these parameters, with respect to those in `by`."""
+        """Return the step of a scene with these parameters, differentiated with respect to those in `by`."""
         if by not in self._tangents:
             self._tangents[by] = self._lowered(tangents=by)
         lowering, parts = self._tangents[by]
@@ -201,7 +203,7 @@ class SeriesStepper:
     def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> StepCode:
         """Return the step without the terms of constants that are zero.
 
-        Unfused, it has the same bits as plain + - * / √ and comparisons on any machine.
+        An unfused step has the same bits as plain + - * / √ and comparisons on any machine.
         """
         if (absent, fused) not in self._codes:
             self._codes[absent, fused] = StepCode(self, self.record(absent, fused), absent, fused)
@@ -226,7 +228,7 @@ def _evaluated(
 
 
 class StepBound(NamedTuple):
-    """How a control step is divided, and how large its truncation error can be.
+    """How a control step is divided, and bounds on its truncation error.
 
     Attributes
     ----------
@@ -310,7 +312,7 @@ class StepCode:
         self.given = [*self._inputs, *q, *v, "status", "span"]
         own = [*self._inputs, *q, *v, "status", "left", "wish", "span"]
         self.rows = [*own, *(f"rest_{name}" for name in own), "rest_lane"]
-        #: Those of them that are read after the step.
+        #: The rows that are read after the step.
         self.results = [*q, *v, "status"]
 
     @property

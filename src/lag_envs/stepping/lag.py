@@ -1,6 +1,6 @@
-"""Control steps behind an actuator of first order: u' = (w - u)/τ, with the command w held.
+"""Control steps with actuators of first order: u' = (w - u)/τ, with the command w held.
 
-From its value u₀ at the step's start a control follows u(t) = w + (u₀ - w) e^(-t/τ). The series of the
+From the value u₀ at the step's start, a control follows u(t) = w + (u₀ - w) e^(-t/τ). The series of the
 control, and of the prescribed coordinate that it moves, are known to every order. The state follows
 ẏ = f(y, u(t)) with the scene's own f: a control that is a place remains quasi-static; a control that is a
 rate accelerates the coordinate that it moves.

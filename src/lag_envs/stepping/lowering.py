@@ -1,4 +1,4 @@
-"""From equations of motion to a record of series: what each order has to compute, without repetition.
+"""From equations of motion to a record of series: the computations of each order, without repetition.
 
 All printers print this record (`lag_envs.stepping.series`). Its nodes are series in time: coordinates,
 velocities, their functions, products and weighted sums. Weights do not change within a step: they are
@@ -77,7 +77,8 @@ class SeriesRecord:
     nodes : tuple of Node
         Ordered so that each needs only earlier ones (at the same order of the series).
     mass : mapping from (i, j), i <= j, to (node, weight, constant)
-        Entries of the mass matrix, weight times node plus constant; the node is -1 where nothing changes.
+        Entries of the mass matrix, weight times node plus constant; the node is -1 if the entry does not
+        change.
     force : tuple of int
         Nodes of the right-hand side; -1 where it vanishes.
     tangents : mapping from str to mapping
@@ -96,7 +97,7 @@ class SeriesRecord:
 
     @property
     def given(self) -> tuple[str, ...]:
-        """The inputs that are the same for all substeps: all but the time."""
+        """The inputs that are the same for all substeps, that is, all but the time."""
         return tuple(name for name in self.inputs if name != ELAPSED)
 
     @cached_property
@@ -133,7 +134,7 @@ class Lowering:
         kind ``control`` (held), ``start`` (its place and rate when the control step begins) and `CLOCK`.
     tangents : sequence of str, optional
         Parameters with respect to which the scalars get derivatives, besides controls and starts; by default
-        they get none at all.
+        the scalars get no derivatives at all.
     rates : mapping from str to Expr
         With lagged controls: for each control, and for each coordinate that it moves, the rate of its
         exponential. Then `prescribed` contains the controls too, with coefficients as in a node ``decay``,
@@ -276,7 +277,7 @@ class Lowering:
                 slope = self._node("reciprocal", (x,))
             first = len(self.nodes)
             self._known[key] = first
-            if key[0] == "pair":  # both are made at once; each is the other's slope
+            if key[0] == "pair":  # sine and cosine are made together; each is the other's slope
                 self.nodes += [("sin", (x, first + 1, *rate), (), 0), ("cos", (x, first, *rate), (), 0)]
             elif atom.function == "tanh":  # the slope is 1 - tanh²
                 self.nodes.append(("tanh", (x, first + 2, *rate), (), 0))
@@ -359,7 +360,7 @@ class Lowering:
         return result
 
     def _single(self, terms: list[tuple[int, Expr]]) -> tuple[int, Expr]:
-        """Return one node and its weight: a common weight is pulled out so that nodes can be shared."""
+        """Return one node and its weight; a common weight is pulled out so that nodes can be shared."""
         first = terms[0][1]
         if all(e.same(first) or e.same(-first) for _, e in terms):
             one = Expr.of(1)
@@ -402,7 +403,8 @@ class Lowering:
     ) -> SeriesRecord:
         """Leave out the terms of constants that are zero, and everything unused.
 
-        Terms are left out after products have been arranged, so the others round as they would with them.
+        Terms are left out after products have been arranged, so the other terms round as if nothing had been
+        left out.
         """
         weights = _weights(self.nodes, entries)
         slopes = [
@@ -427,7 +429,7 @@ class Lowering:
                 nodes.append(Node("sum", (), (0.0,)))
 
         arguments = {args[0] for op, args, _, _ in self.nodes if op not in ("sum", "product") and args}
-        # Slopes may be referred to before they are made; they follow at a fixed distance.
+        # Slopes may be referred to before they are made, because they follow at a fixed distance.
         for i, (op, args, ws, index) in enumerate(self.nodes):
             numbers = tuple(next(value) for _ in ws)
             if op == "sum":

@@ -38,7 +38,7 @@ _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
 
 class LaneLayout:
-    """Where the numbers of a lane lie: rows, one behind the other or `BLOCK` numbers apart.
+    """The places of the numbers of a lane: rows that lie one behind the other or `BLOCK` numbers apart.
 
     Attributes
     ----------
@@ -49,8 +49,8 @@ class LaneLayout:
     status : int
         The number of attempts, negative where the lane is not stepped.
     left, wish, span : int
-        What is left of the control step, 0 where it is done; the step that is wished for; the control step's
-        length [s].
+        What is left of the control step (0 when it is done), the length wished for the next substep, and the
+        length of the control step [s].
     bounds : int
         Sums of the bounds on what places and velocities leave out; a single lane has them.
     rows : int
@@ -68,7 +68,7 @@ class LaneLayout:
 
 
 class Registers(NamedTuple):
-    """How many vector registers the processor has, and how many doubles one of them holds."""
+    """The number of the processor's vector registers, and the number of doubles that each of them holds."""
 
     number: int
     doubles: int
@@ -92,7 +92,7 @@ class Machine:
         self._b, self._fused = builder, fused
         self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
         self._lanes = lanes
-        # A product takes four numbers: two sums and two factors. What finds no register goes to memory.
+        # A product takes four numbers: two sums and two factors. Numbers that find no register go to memory.
         self.group = max(2, registers().number // (4 * -(-lanes // registers().doubles)))
         memory = builder.alloca(self.kind, entries)
         memory.align = 8 * lanes
@@ -199,7 +199,7 @@ class Machine:
         self._b.store(value, self._at(slot, k))
 
     def aside(self, values: Sequence) -> Callable[[], list]:
-        # Left to itself, LLVM keeps the results of a loop in registers, and spills the next loop's own sums.
+        # Without this, LLVM keeps the results of a loop in registers, and spills the next loop's own sums.
         b, void = self._b, ir.VoidType()
         with b.goto_entry_block():
             places = b.alloca(self.kind, len(values))
@@ -207,7 +207,7 @@ class Machine:
         at = [b.gep(places, [ir.Constant(_INT, i)]) for i in range(len(values))]
         for place, value in zip(at, values, strict=True):
             b.store(value, place)
-        # As far as LLVM knows, this changes what lies there; it generates no instruction.
+        # As far as LLVM knows, this changes the memory at that place; it generates no instruction.
         kind = ir.FunctionType(void, [places.type])
         b.call(ir.InlineAsm(kind, "", "r,~{memory}", side_effect=True), [places])
         return lambda: [b.load(place) for place in at]
@@ -240,7 +240,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: these are short, and long code compiles slowly."""
+        """Return the request not to unroll a loop: the loops are short, and long code compiles slowly."""
         module = self._b.module
         unrolled = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         off = ir.Constant(_BIT, 0)
@@ -296,10 +296,10 @@ def _version() -> str:
 
 
 def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
-    """Return a function for compiled code that stands once, in a module of its own.
+    """Return a function for compiled code whose code exists only once, in a module of its own.
 
-    Whoever calls it is linked with it when it is loaded. Numba would put a copy into every caller, and into
-    the callers' callers, and compile them all.
+    Callers are linked with this function when they are loaded. Numba itself would put a copy into every
+    caller, and into the callers' callers, and compile them all.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
     kind : ir.FunctionType
         Its type; the first argument is a pointer. Compiled code gives an array and an index in its place.
     write : callable
-        Writes it into a module.
+        Writes the function into a module.
     """
     known = {_DOUBLE: types.float64, _INT: types.int64, ir.VoidType(): types.void}
     arguments = ", ".join(["rows", "at", *(f"a{i}" for i in range(len(kind.args) - 1))])
@@ -350,8 +350,8 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
     record : SeriesRecord
         What is stepped.
     lanes : int
-        How many steps are taken at once. The rows of a single lane are one number, of several `BLOCK`
-        numbers.
+        How many steps are taken at once. A row is one number for a single lane, and `BLOCK` numbers for
+        several lanes.
     fused : bool, default True
         Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
     """
@@ -422,7 +422,7 @@ def compile_series_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Ca
     record : SeriesRecord
         What is stepped, made with tangents.
     columns : tuple of str
-        What derivatives are taken with respect to: places, velocities, and names in the record's tangents.
+        The variables of the derivatives: places, velocities, and names in the record's tangents.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
     kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])

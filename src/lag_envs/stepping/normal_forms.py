@@ -62,7 +62,7 @@ class NormalForm:
     inertia : Expr
         The free coordinate's entry of the mass matrix.
     chosen : int
-        Order of the flow's series, if it has one; 0 to choose it by the control step.
+        Order of the flow's series, if it has one; with 0 the control step determines the order.
     """
 
     kind: ClassVar[type[Any]]
@@ -251,11 +251,11 @@ class NormalForm:
     def certified_speed(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> float | None:
-        """Return the largest |q'| for which one series per step is certified, all else as given [rad/s].
+        """Return the largest |q'| for which one series per step is certified, with all else as given [rad/s].
 
-        Up to it, and not beyond, `step_bound` reports one substep, whose truncation error is at most
-        1e-12 rad/s. It is negative if drive, drag or field are too strong for one series at any speed, and
-        None for a form that is stepped to rounding.
+        Up to this speed, and not beyond, `step_bound` reports one substep, whose truncation error is at most
+        1e-12 rad/s. The result is negative if drive, drag or field are too strong for one series at any
+        speed, and None for a form that is stepped to rounding.
         """
         return None
 
@@ -374,7 +374,7 @@ def normal_form(m: Mechanics, order: int = 0) -> NormalForm | None:
     m : Mechanics
         The equations of motion.
     order : int
-        Order of the flow's series, if it has one; by default it is chosen by the control step.
+        Order of the flow's series, if it has one; by default the control step determines the order.
     """
     if (m.key, order) not in _known:
         form = normal_form(m) if order else _recognised(m)
@@ -463,7 +463,7 @@ def _negative(part: _Parts) -> _Parts:
 
 
 def _unheld(part: _Parts) -> _Parts:
-    """Return the coefficient's only constant on its own; its held factor is applied elsewhere."""
+    """Return the coefficient's only constant without its held factor, which is applied elsewhere."""
     constants = [constant for _, constant in part.values()]
     return {Expr.of(1).text: (Expr.of(1), constants[0])} if constants else {}
 
@@ -494,7 +494,7 @@ def _form(
     parts: Mapping[str, _Parts],
     others: Mapping[str, Expr] | None = None,
 ) -> NormalForm:
-    """Name the constants; equal ones share a name."""
+    """Name the constants; equal constants share a name."""
     expressions: dict[str, Expr] = dict(others or {})
     names = {expr.text: name for name, expr in expressions.items()}
     terms = {}

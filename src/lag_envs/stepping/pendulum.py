@@ -46,8 +46,8 @@ TOLERANCE = 1e-12
 #: Factor of the bound of one series of order 6 or more, for the tangent's other poles: 1.2426, rounded up.
 LOSS = 1.25
 MAX_SUBSTEPS = 1_000_000
-#: Substeps compute the coefficients up to this one with twice the digits. Rounding errors of later ones are
-#: below 1e-20, for the coefficients shrink at least fivefold from one to the next.
+#: Substeps compute the coefficients up to this order with twice the digits. Rounding errors of later
+#: coefficients are below 1e-20, because each coefficient is at least five times smaller than the one before.
 TWOFOLD = 5
 
 _SIN = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(8)]
@@ -103,7 +103,7 @@ def taylor_coefficients(w: Any, c: Any, s: Any, coeffs: Coefficients, order: int
         H.append(sum_of_products(pairs if k % 2 else [(0.5 * W[k // 2], W[k // 2]), *pairs]))
         work = (2.0 * gamma) * H[k - 1] - d * W[k - 1] - (r * W[k - 2] if k > 1 else 0.0)
         Q.append(H[k] + work * (1.0 / k))
-        # P_k itself is not needed: it goes straight into W. The terms known last are added last.
+        # P_k itself is not needed, as it goes straight into W. The terms that are known last are added last.
         early = sorted(range(k), key=lambda j: (max(j, k - 1 - j), j))
         torque = sum_of_products((Q[j], W[k - 1 - j]) for j in early)
         change = W[k] * (gamma * (-1.0 / (k + 1))) + torque * (-1.0 / (k * (k + 1)))
@@ -115,8 +115,8 @@ def rotate(c: Any, s: Any, angle: Any, polynomial: Callable = polynomial) -> tup
     """Turn the pair (cos, sin) by an angle of at most 0.6 rad and restore its length to rounding."""
     z = angle * angle
     sine = angle * polynomial(_SIN, z)
-    # One Newton step towards c² + s² = 1 goes into the same sum. So the change of c and s is small and is
-    # rounded once, without bias. Scaling afterwards would be biased, and energy would drift.
+    # One Newton step towards c² + s² = 1 goes into the same sum. Therefore the change of c and s is small and
+    # is rounded once, without bias. Scaling afterwards would be biased, and the energy would drift.
     less = z * polynomial(_COS[1:], z) - 0.5 * ((c * c - 1.0) + s * s)
     return c + (c * less - s * sine), s + (s * less + c * sine)
 
@@ -132,8 +132,8 @@ def step_change(omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order:
 def substep(w: Twofold, c: Twofold, s: Twofold, coeffs: Coefficients, order: int = ORDER) -> tuple:
     """Return hθ', cosθ and sinθ after one of many steps, and the change of θ, with twice the digits.
 
-    Errors of many steps add up, at best like a random walk. They change a pendulum's energy, hence its
-    frequency, and so its phase error grows with time. So each step has to be more exact than a float.
+    Errors of many steps add up, at best like a random walk. They change a pendulum's energy and therefore its
+    frequency, so its phase error grows with time. Each step therefore has to be more exact than a float.
 
     Parameters
     ----------
@@ -161,8 +161,9 @@ def step(theta: Any, omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, o
 def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER) -> list:
     """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step from those of θ, θ' after it.
 
-    Those of cosθ and sinθ are included in θ's. Changes obey the linearised equation: with S, C the series of
-    sine and cosine, dW_k = (k+1) dθ_{k+1}, and dD for k = 0, dR for k = 1 on the right-hand side,
+    The cotangents of cosθ and sinθ are included in that of θ. Changes obey the linearised equation: with S, C
+    the series of sine and cosine, dW_k = (k+1) dθ_{k+1}, and dD for k = 0, dR for k = 1 on the right-hand
+    side,
 
         (k+1) dW_{k+1} = -Σ_j Q_j dθ_{k-j} - Γ dW_k - S_k dA - C_k dB - W_k dΓ.
 
@@ -261,14 +262,14 @@ def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
     a, b, gamma, d, r = scaled(coeffs, h)
     speed, drag = xp.abs(omega * h), xp.abs(gamma)
     first, push = speed + drag, xp.abs(d) + drag * speed
-    # Without a ramp the smallest y is best, and no root is needed.
+    # Without a ramp, the smallest y is best, and no root is needed.
     room = x * (x - 0.5 * xp.maximum(first, 0.2 * x)) - push
     field = a * a + b * b
     fits = (first <= x) & (room >= 0.0) & (field <= room * room)
     if _absent(r):
         return fits
     second, most = (xp.abs(a) if _absent(b) else xp.sqrt(field)) + push, x * x
-    # With one, the largest y is: the smaller of x and 2 (x - b/x).
+    # With a ramp, the largest y is best: the smaller of x and 2 (x - b/x).
     product = xp.minimum(most, 2.0 * (most - second)) * xp.maximum(0.5 * most, second)  # x y z
     return fits & ((first * second + xp.abs(r)) * x <= product)
 
@@ -294,7 +295,7 @@ def least_majorant(omega: float, coeffs: Coefficients, h: float) -> float:
     """Return an x, small though not the smallest, for which the conditions of `certified` hold."""
     a, b, gamma, d, r = scaled(coeffs, h)
     speed, more = abs(omega * h), abs(r) ** (1.0 / 3.0)
-    # With `more` added to one and its square to the other, their product grows by |R| at least.
+    # With `more` added to one factor and its square to the other, their product grows by at least |R|.
     first = speed + abs(gamma) + more
     second = math.hypot(a, b) + abs(d) + abs(gamma) * speed + more * more
     return max(first, 0.25 * (first + math.sqrt(first * first + 16.0 * second)), math.sqrt(second / 0.9))
@@ -336,7 +337,7 @@ def truncation_bound(omega: float, coeffs: Coefficients, dt: float, order: int =
         one = certified(omega, coeffs, dt, largest, np)
     n = 1.0 if one else min(float(_substeps(omega, *coeffs, dt, order)), 1e15)
     h = dt / n
-    # One step needs the bound only at its start, several need it throughout.
+    # A single step needs the bound only at its start; several steps need it throughout.
     x = min(least_majorant(omega, coeffs, dt), largest) if one else _rate(omega, *coeffs, dt) * h
     left_out = tail(x, order) * (1.0 if one else n / LOSS)  # the bound of substeps has no such factor
     return Bound(int(n), order, left_out / (order + 2), left_out / h)
@@ -351,8 +352,8 @@ def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untype
     """Return x/h such that, for small h, the bound holds anywhere in the interval."""
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
-    # What the field adds to the speed is limited by its acceleration, and by its energy between top and
-    # bottom, 2 field.
+    # The speed that the field can add is limited by the field's acceleration, and by its energy between top
+    # and bottom, 2 field.
     speed = min(abs(omega) + field * dt, math.sqrt(omega * omega + 4.0 * field)) + push * dt
     if gamma * speed > field + push:
         speed = max(abs(omega), (field + push) / gamma)
@@ -407,7 +408,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
     # The sum's rounding error is carried forward (Kahan): equal terms would all round in the same direction.
     turned = lost = 0.0
     for i in range(int(n)):
-        # In units of the substep: the drift's rate at its start, and its growth.
+        # The drift's rate at the substep's start, and the growth of this rate, in units of the substep.
         drift = (delta + ramp * (i * h) - ramp / gamma) / gamma * h
         slope = ramp / gamma * h * h
         P[0] = a * s + b * c
@@ -435,7 +436,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
         end = turned + angle
         lost = (end - turned) - angle
         turned = end
-        # Computed from the very start, so that errors do not add up.
+        # This is computed from the start of the whole step, so that errors do not add up.
         p, q = math.cos(turned), math.sin(turned)
         p, q = p + lost * q, q - lost * p
         c, s = start_c * p - start_s * q, start_s * p + start_c * q
@@ -479,7 +480,7 @@ def _slow_slopes(slopes, V, P, Q, c, s, g, h, elapsed, gamma, delta, ramp, order
 
 
 def _no_slopes(slopes, V, P, Q, c, s, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
-    """Carry no derivatives: what a plain step compiles in place of `_slow_slopes`."""
+    """Carry no derivatives; a plain step compiles this in place of `_slow_slopes`."""
 
 
 def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # type: ignore[no-untyped-def]
@@ -507,7 +508,7 @@ def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # t
         m = 1.0
         if not drift:
             m = np.ceil(max(1.0, (12.0 * field + 4.0 * push) / gamma * (dt - layer)))
-    # A substep along the slow manifold costs as much as 50 plain ones.
+    # A substep along the slow manifold costs as much as 50 plain substeps.
     if not n + 50.0 * m <= MAX_SUBSTEPS:
         n = -1.0
     return layer, n, m, drift

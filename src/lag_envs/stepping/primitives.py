@@ -1,9 +1,9 @@
 """Building blocks of compiled code: recorded formulas, a few instructions, the random generator.
 
-The generator is counter-based: a draw is a pure function of (key, episode, step, index). So draws can be made
-inside a compiled loop, cost a few integer operations, and do not depend on how many environments are stepped
-together. The function is the output mix of SplitMix64 [1]_ applied to a Weyl sequence. The origin of that
-sequence is itself such a mix of key and episode.
+The generator is counter-based: a draw is a pure function of (key, episode, step, index). Therefore draws can
+be made inside a compiled loop, cost a few integer operations, and do not depend on how many environments are
+stepped together. The function is the output mix of SplitMix64 [1]_ applied to a Weyl sequence. The origin of
+that sequence is itself such a mix of key and episode.
 
 References
 ----------
@@ -99,7 +99,8 @@ def _replace(builder: ir.IRBuilder, at: ir.Value, old: ir.Value, new: ir.Value) 
     return builder.extract_value(builder.cmpxchg(at, old, new, "acq_rel", "acquire"), 1)
 
 
-#: ``(array, index)``: the number. What another thread wrote before it stored the number is visible then too.
+#: ``(array, index)``: returns the number. Everything that another thread wrote before it stored the number is
+#: then visible too.
 atomic_load = _atomic(lambda b, at: b.load_atomic(at, "acquire", 8), 0, types.uint64)
 #: ``(array, index, value)``
 atomic_store = _atomic(lambda b, at, value: b.store_atomic(value, at, "release", 8), 1, types.void)
@@ -139,7 +140,7 @@ def moved(typingctx, array, address):  # type: ignore[no-untyped-def]
 def read_rows(typingctx, array, first, stride, rows):  # type: ignore[no-untyped-def]
     """Return ``array[first + row * stride]`` for each of these rows, a tuple of literal ints.
 
-    To Numba this is one step, where an expression per row would be a dozen.
+    For Numba this is one step, whereas an expression for each row would be a dozen.
     """
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -167,8 +168,8 @@ def write_rows(typingctx, array, first, stride, rows, numbers):  # type: ignore[
 def copy_rows(typingctx, array, first, stride, rows, size, table, column):  # type: ignore[no-untyped-def]
     """Copy ``array[first + (rows[0] + k) * stride + i]``, i < size, to ``table[k, column + i]``, k < rows[1].
 
-    Two loops, whatever the number of rows: vector instructions for each row would take longer to compile. A
-    loop that wrote all rows at once would have to check them for overlap.
+    There are two loops, whatever the number of rows, because vector instructions for each row would take
+    longer to compile. A loop that wrote all rows at once would have to check them for overlap.
     """
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -208,12 +209,12 @@ def _places(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequence)
 def at_address(name: str, arguments: int) -> Callable:
     """Return ``name(address, *arguments)`` for compiled code, which calls other compiled code at an address.
 
-    What is called returns nothing, and cannot fail.
+    The called code returns nothing and cannot fail.
     """
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         kind = context.call_conv.get_function_type(types.none, signature.args[1:])
-        # Where Numba's functions put their result, and what went wrong.
+        # The places where Numba's functions put their result and their error.
         room = [cgutils.alloca_once(builder, pointer.pointee) for pointer in kind.args[:2]]
         given = context.get_arg_packer(signature.args[1:]).as_arguments(builder, args[1:])
         builder.call(builder.inttoptr(args[0], kind.as_pointer()), [*room, *given])
@@ -253,7 +254,7 @@ def block(operations: Sequence[Operation], inputs: Sequence[str], outputs: Seque
     inputs : sequence of str
         The arguments, all float64.
     outputs : sequence of str or float
-        Which results to return, as a tuple.
+        The results to return, as a tuple.
     """
     boolean = {operation.name for operation in operations if operation.op in BOOLEAN}
     kinds = [types.boolean if o in boolean or isinstance(o, bool) else types.float64 for o in outputs]
@@ -284,7 +285,7 @@ def emit(
     Parameters
     ----------
     builder : llvmlite.ir.IRBuilder
-        Where to write.
+        The builder that writes.
     operations : iterable of Operation
         The operations.
     values : dict of str to llvmlite.ir.Value

@@ -1,8 +1,8 @@
 """Prints recorded formulas and the series' step as source text, in Python, JavaScript or C++.
 
-The text is unfused: + - * / √, comparisons, and a few exact operations on bits. So it gives the same bits in
-every language and on any machine; C++ also on a GPU. `OPERATIONS` has a line per operation and a column per
-language; loops, including those over the order of the series, are printed as loops.
+The text is unfused: + - * / √, comparisons, and a few exact operations on bits. It therefore gives the same
+bits in every language and on any machine, and in C++ also on a GPU. `OPERATIONS` has a line per operation and
+a column per language; loops, including those over the order of the series, are printed as loops.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ STATEMENTS: Mapping[str, tuple[str, str, str]] = {
 }
 
 
-#: Statements of a function, beyond which it is split: browsers run functions with more than about 60 kB of
-#: code much more slowly.
+#: A function with more statements than this is split, because browsers run functions with more than about 60
+#: kB of code much more slowly.
 LARGEST = 1500
 
 
@@ -90,9 +90,10 @@ class Language(NamedTuple):
     arguments : mapping
         Declarations of a function's arguments, where their names are not enough.
     largest : int, optional
-        Statements of a function, beyond which it is split.
+        Largest number of statements of a function; longer functions are split.
     own_functions : bool
-        Whether sines and so on are printed too. If not, the library's functions are called, with other bits.
+        Whether sines and other elementary functions are printed too. If not, the library's functions are
+        called, which give other bits.
     own_memory : bool
         Whether each function has its own arrays; if not, all functions share them.
     """

@@ -1,7 +1,7 @@
 """One step of any equations of motion by Taylor series, with a proved bound on what the series leaves out.
 
-The algorithm stands here once, written for a `Target` (`lag_envs.stepping.target`): something that adds and
-multiplies, keeps series in numbered slots and runs loops. Targets print it to machine code
+The algorithm is written only once, for a `Target` (`lag_envs.stepping.target`): something that adds and
+multiplies, keeps series in numbered slots and runs loops. Targets print the algorithm as machine code
 (`lag_envs.stepping.machine`) or carry it out on Python numbers.
 
 **Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by
@@ -39,18 +39,18 @@ from lag_envs.stepping.target import Target
 #: The orders that a series may have.
 SMALLEST_ORDER, LARGEST_ORDER = 4, 24
 
-#: What a substep's truncation may be, relative to the size of the velocities.
+#: Largest truncation error of a substep, relative to the size of the velocities.
 TOLERANCE = 1e-14
 #: While a control that lags is still far from its command, a substep is at most this many time constants.
 REACH = 2.0
-#: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
+#: Numbers that are set aside for one series: a velocity has N + 1 of them, and one more if N is odd.
 STRIDE = LARGEST_ORDER + 3
-#: How often a step is shortened before it counts as failed.
+#: How many times a step is shortened before it counts as failed.
 TRIES = 4
 
 
 def check_order(name: str, value: Any) -> int:
-    """Return an order that a task may choose, or raise a ValueError; below 6 no step would be worth it."""
+    """Return an order that a task may choose, or raise a ValueError; orders below 6 would not pay."""
     if type(value) is not int or not 6 <= value <= LARGEST_ORDER:
         raise ValueError(f"{name} must be a whole number from 6 to {LARGEST_ORDER}, got {value!r:.60}")
     return value
@@ -72,7 +72,7 @@ def following(t: Target, order: Any) -> tuple[Any, Any]:
 
 
 def evenly(items: Sequence, most: int) -> list[Sequence]:
-    """Return as few groups of at most `most` items as there can be, nearly equal: a small one wastes time."""
+    """Return the fewest groups of at most `most` items, nearly equal, since a small group wastes time."""
     n, count = len(items), -(-len(items) // most)
     return [items[i * n // count : (i + 1) * n // count] for i in range(count)]
 
@@ -89,7 +89,7 @@ class Factor(NamedTuple):
 
 
 class ExpansionStart(NamedTuple):
-    """What an expansion knows beside its slots: coefficients of order 0, the inverse of M_0, weights."""
+    """An expansion's data besides its slots: coefficients of order 0, the inverse of M_0, weights."""
 
     zero: dict[int, Any]
     inverse: Inverse
@@ -97,7 +97,7 @@ class ExpansionStart(NamedTuple):
 
 
 class StepProgress(NamedTuple):
-    """A control step on its way.
+    """A control step in progress.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class Series:
     def __init__(self, record: SeriesRecord) -> None:
         self.record, self.size = record, record.size
         self.slot_of: dict[tuple[str, int], int] = {}
-        #: Nodes that need more than their value.
+        #: Nodes of which more than the value is needed.
         self.live = self._find_live()
         #: Products of series, by what needs them: a node or a place (i, j) in the mass matrix.
         self.pairs: dict[Any, tuple[Factor, Factor]] = {}
@@ -172,12 +172,12 @@ class Series:
         return self.slot_of[kind, i]
 
     def factor_of(self, n: int) -> Factor:
-        """Return where a node's coefficients are."""
+        """Return the place of a node's coefficients."""
         node = self.record.nodes[n]
         return Factor(self._slot("v", node.index) if node.op == "velocity" else self._slot("x", n))
 
     def slope_of(self, n: int) -> Factor:
-        """Return where D_k = k x_k of a function's argument x is."""
+        """Return the place of D_k = k x_k for a function's argument x."""
         args = self.record.nodes[n].args
         if len(args) > 2:
             return Factor(self.factor_of(args[2]).slot, back=1)
@@ -205,7 +205,7 @@ class Series:
         Parameters
         ----------
         t : Target
-            Where to.
+            The target to which the coefficients are written.
         inputs : dict
             Constants, controls and starts of moving prescribed coordinates, by name.
         q, v : sequence of number
@@ -516,24 +516,24 @@ class Series:
     ) -> tuple[Any, Any, list, list, list]:
         """Take a certified step of length h, or of as much of h as can be certified from one expansion.
 
-        Coefficients of a shorter step are those of h times powers of their ratio: so nothing is computed
-        again.
+        Coefficients of a shorter step are those of h times powers of the ratio of both lengths, so nothing is
+        computed again.
 
         Parameters
         ----------
         t, inputs, q, v, h, order
             See `expand`.
         tolerance : number
-            What v may leave out, in its sizes, see `Certificate`.
+            What v may leave out, relative to its size; see `Certificate`.
         wanted : condition, optional
-            Where a result is wanted; only there it is worth trying again.
+            Where a result is wanted; trying again pays only where one is wanted.
 
         Returns
         -------
         done : condition
             Whether a step was certified.
         h : number
-            Its length, or that of the shortest that was tried.
+            The length of that step, or of the shortest step that was tried.
         q, v : list of number
             Places and velocities at its end; meaningless where there was none.
         bounds : list of number
@@ -564,16 +564,16 @@ class Series:
         done, part, *bounds = t.when(going(done), shorten, [done, one, *bounds_of_all])
         h = t.mul(h, part)
         q, v = self.advance(t, q, h, order)
-        for x in (*q, *v):  # what overflows is not done
+        for x in (*q, *v):  # a step that overflows is not done
             done = t.both(done, t.less(t.abs(x), t.number(math.inf)))
         return done, h, q, v, bounds
 
     def _within_lags(self, t: Target, inputs: dict[str, Any], h: Any) -> Any:
-        """Return a step that lagged controls do not make hopeless, h at most.
+        """Return a step, at most h, that is short enough for lagged controls.
 
         With z = h/τ, an exponential's coefficients sum up to e^z times its size. It has died out as far as
-        e^(-z) after a time of z, so steps may double. Much longer ones would not be certified, and terms that
-        cancel would be taken for large velocities.
+        e^(-z) after a time of z, so steps may double. Much longer steps would not be certified, and terms
+        that cancel would be taken for large velocities.
         """
         for name in self.record.inputs:
             if name.startswith("decay_"):
@@ -593,7 +593,7 @@ class Series:
         Returns
         -------
         lane : StepProgress
-            What it is afterwards; as before where nothing was left or certified.
+            The control step afterwards; it is unchanged if nothing was left, or nothing could be certified.
         bounds : list of number
             Bounds on what places and velocities leave out.
         """
@@ -605,7 +605,8 @@ class Series:
         done = t.both(done, wanted)
         used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
-        # The next is twice as long, or takes all that is left if that is less than three times this one.
+        # The next substep is twice as long, or takes all that is left if that is less than three times this
+        # substep.
         longer = t.select(t.less(left, t.mul(t.number(3.0), used)), left, t.add(used, used))
         after = StepProgress(
             [t.select(done, x, before) for x, before in zip(q, lane.q, strict=True)],
@@ -619,7 +620,7 @@ class Series:
         return after, [t.select(done, bound, zero) for bound in bounds]
 
     def _inputs_at(self, t: Target, inputs: dict[str, Any], dt: Any, left: Any) -> dict[str, Any]:
-        """Return the inputs when so much is left of a control step dt."""
+        """Return the inputs when the given part of a control step dt is left."""
         return inputs | {ELAPSED: t.sub(dt, left)} if ELAPSED in self.record.inputs else inputs
 
 

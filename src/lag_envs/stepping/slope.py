@@ -33,7 +33,7 @@ from lag_envs.stepping.pendulum import TWOFOLD, rotate
 from lag_envs.stepping.tracing import clip, pairwise_sum, polynomial
 from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
-SMALL_DECAY = 0.25  # up to this, the series of φ₂ below is exact to rounding: .25^12/14! = 7e-19
+SMALL_DECAY = 0.25  # up to this value, the series of φ₂ below is exact to rounding: .25^12/14! = 7e-19
 _PHI2 = [(-1.0) ** k / math.factorial(k + 2) for k in range(12)]
 TURN_ORDER = 12
 SMALL_TURN = 0.25  # .25^13/13! = 2e-18
@@ -104,9 +104,9 @@ def crossing_time(x: Any, v: Any, force: FixedSlope, dt: Any, xp: Any) -> Any:
     -----
     Newton's method on the closed form, from below. It starts from the time of the motion without damping, or
     from the line that x(t) approaches if it slows down. A cylinder that speeds up is never far from the
-    former. For one that slows down, Newton's method is monotone but may advance by no more than 1/Γ at a
-    time. So there it is also applied to the logarithm of the boundary layer, e^-z = m(z), which is monotone
-    too, and the later of the two times is taken.
+    former. For a cylinder that slows down, Newton's method is monotone but may advance by no more than 1/Γ at
+    a time. In this case it is therefore also applied to the logarithm of the boundary layer, e^-z = m(z),
+    which is monotone too, and the later of the two times is taken.
     """
     acceleration, damping_rate = force
     excess = damping_rate * v - acceleration

@@ -129,21 +129,21 @@ class SeriesTangent:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
         linear = self._known_linear.get(dt) or self._linear(dt)
-        self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
+        self._known_linear = {dt: linear}  # only the latest is kept, since a scene mostly has one dt
         seeds, size = np.ascontiguousarray(cotangents.T), states.shape[1]
         given = np.empty((size + controls.shape[1], len(states)))
         given[:size], given[size:] = states.T, controls.T  # three times as fast as np.concatenate
         found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
         rows: Any = np.arange(len(states))
         some: Any = slice(None)
-        while len(rows):  # all at first, then those whose substeps were too long for the derivatives
+        while len(rows):  # first all rows, then those whose substeps were too long for the derivatives
             before, parts = longest[some], [np.ascontiguousarray(x[:, some]) for x in (given, seeds, found)]
             shorter = before.copy()
             self._pull(*parts, shorter, *linear, dt, order)
             given_up, too_long = rows[shorter == 0.0], rows[(0.0 < shorter) & (shorter < before)]
             found[:, some], longest[some] = parts[-1], shorter
-            # In reverse mode no substep is longer than the shortest, so there may be too many. In forward
-            # mode substeps grow again.
+            # In reverse mode no substep is longer than the shortest, so there may be too many substeps. In
+            # forward mode substeps grow again.
             if len(given_up):
                 slopes, refused = self.jacobian(states[given_up], controls[given_up], dt, order)
                 if refused:

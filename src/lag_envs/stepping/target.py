@@ -1,4 +1,4 @@
-"""What the step of a series needs of numbers: arithmetic, series in numbered slots, loops.
+"""The operations that the step of a series needs: arithmetic, series in numbered slots, loops.
 
 `Target` lists the operations. `lag_envs.stepping.machine` and `lag_envs.stepping.script` print them; a test
 carries them out on Python's floats.
@@ -14,7 +14,7 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.tracing import MAGIC, Operation
 
-#: How many products are summed side by side in one loop, where registers are no concern.
+#: How many products are summed side by side in one loop if the number of registers does not matter.
 GROUP = 8
 
 

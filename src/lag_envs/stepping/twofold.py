@@ -2,8 +2,8 @@
 
 A sum over many substeps is as exact as a single step only if each substep is more exact than a float. The
 series' formulas run on these numbers as they do on floats, and are recorded in the same way. Each operation
-is made of error-free transformations [1]_: the rounded result, and the rounding error, from additions and one
-fused multiply-add.
+consists of error-free transformations [1]_, which compute the rounded result and the rounding error from
+additions and one fused multiply-add.
 
 References
 ----------

@@ -99,7 +99,7 @@ class Actuators:
     def delay(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that replace a command by the one in force, or send it, if that changes in a step.
 
-        Where all are late by whole steps, a command of an earlier step is in force throughout.
+        If all commands are late by whole steps, a command of an earlier step is in force throughout.
         """
         if not self.ring.slots:
             return []
@@ -115,7 +115,8 @@ class Actuators:
     def choose(self, rows: RowsWithRings) -> list[str]:
         """Return the lines that find the command in force at `t`, and when the next one takes effect.
 
-        It is the one sent last among those that have arrived; this piece of the step ends when another does.
+        It is the command sent last among those that have arrived; this piece of the step ends when another
+        one arrives.
         """
         ring = self.ring
         if not ring.slots:

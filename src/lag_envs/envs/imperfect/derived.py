@@ -22,8 +22,8 @@ from lag_envs.tasks.base import Task
 class DerivedConstants:
     """The constants that depend on the drawn parameters, and the lines that compute them.
 
-    They are computed with twice the digits, from drawn and other parameters, and rounded once. So an
-    environment gives the same bits as one made with these values.
+    They are computed with twice the digits, from drawn and other parameters, and rounded once. Therefore an
+    environment gives the same bits as an environment that is made with these values.
     """
 
     def __init__(self, task: Task, absent: frozenset[str]) -> None:
@@ -81,7 +81,7 @@ class DerivedConstants:
             (share,) = trace.inputs(f"share{j}")
             outputs[f"p_{d.name}"] = d.printed(share, base, low, high, trace)
         code = block_lines(trace, outputs, fused=False)
-        # Derived parameters are computed as Python does it: one rounding for each operation.
+        # Derived parameters are computed as in Python, with one rounding for each operation.
         trace = ElementaryTrace()
         numbers = self._given(trace, constants)
         self._follow(numbers)
@@ -96,7 +96,7 @@ class DerivedConstants:
         return [*code, *block_lines(trace, {f"k_{name}": found[name] for name in self.changed})]
 
     def _given(self, trace: Any, constants: dict[str, Any]) -> dict[str, Any]:
-        """Return all parameters as inputs, but zeros as zero."""
+        """Return all parameters as inputs, except that zeros stay zero."""
         numbers: dict[str, Any] = {}
         for name in parameter_names(self._scene):
             at = constants[f"self_{name}"]

@@ -1,8 +1,8 @@
 """Steps that imperfect sensors or actuators divide: commands change, or observations are taken, within them.
 
 A step is moved piece by piece. A piece ends where a command comes into force, an observation is taken, or the
-step is over. In a batch each environment has pieces of its own, and all go on side by side until the one with
-the most pieces is done.
+step is over. In a batch each environment has pieces of its own, and all go on side by side until the
+environment with the most pieces is done.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class DividedProgram(WholeProgram):
 
     @property
     def _move_by_flow(self) -> list[str]:
-        # What the fast formula does not cover is moved by the second loop.
+        # Lanes that the fast formula does not cover are moved by the second loop.
         fast = ["moved = select(t < k_dt, select(within, 1.0, 2.0), 0.0)"]
         slow = ["moved = select(status < 0, 0.0, 1.0)", "failed = 1.0 - moved"]
         first = [*self._load_piece, *self._span, *self._stepper.fast, *fast, *self._end_piece]

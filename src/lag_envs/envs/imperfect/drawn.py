@@ -15,7 +15,7 @@ from lag_envs.tasks.base import Task
 class DrawnProgram(Program):
     """The compiled functions of a task with drawn parameters; the arguments are those of `Program`.
 
-    The drawn parameters ``p_`` are rows, and so are the constants that depend on them. Apart from that, and
+    The drawn parameters ``p_`` are rows, and so are the constants that depend on them. Apart from this, and
     from keeping observations within their bounds, steps are those of any batch of different environments.
     """
 

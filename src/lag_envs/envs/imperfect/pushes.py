@@ -12,7 +12,7 @@ from lag_envs.tasks.imperfections import Imperfections
 def pushes(
     options: Imperfections, state: Sequence[str], constants: Mapping[str, Any]
 ) -> tuple[list[str], list[str]]:
-    """Return names for the state after a push, if there is one, and the lines that compute them.
+    """Return names for the state after a possible push, and the lines that compute these.
 
     Parameters
     ----------

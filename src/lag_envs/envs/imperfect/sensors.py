@@ -43,10 +43,11 @@ class Sensors:
         self._options, self._o, self._observe = options, observed, observe
         self._low, self._high = constants["age_low"], constants["age_high"]
         every = constants["every"]
-        #: Whether a reading is due after step ``n``; empty if one always is.
+        #: Whether a reading is due after step ``n``; empty if a reading is always due.
         self.due = f"np.floor(n / {every}) * {every} == n" if options.observation_every > 1 else ""
         self.shown = [f"h{i}" for i in range(len(observed))]
-        #: The observation taken within a step, if all are of one age; else it goes to its slot at once.
+        #: The observation taken within a step, if all observations have one age; otherwise it goes to its
+        #: slot at once.
         single = options.within and not options.jittered
         self.taken = [f"m{i}" for i in range(len(observed))] if single else []
         self._seen = {f"seen{i}": o for i, o in enumerate(observed)}
@@ -76,7 +77,8 @@ class Sensors:
     def _each_coming(self, body: Sequence[str]) -> list[str]:
         """Return the loop over the readings to come, each of its own age, that may be taken in this step.
 
-        One of age 0 is taken at the step's end, none at its beginning, which was the end of the last.
+        A reading of age 0 is taken at the step's end; no reading is taken at its beginning, which was the end
+        of the last step.
         """
         lines = [
             "part = uniform(key_age, np.uint64(n + coming), np.uint64(0))",
@@ -90,7 +92,7 @@ class Sensors:
         ]
 
     def begin(self, rows: RowsWithRings) -> list[str]:
-        """Return the lines that show a start as if it had lasted for a long time."""
+        """Return the lines that show a start as if the state had been the same for a long time."""
         return [*self._observe, *rows.fill(self.ring, self._seen), *self.sense, *self._show(rows)]
 
     def read(self, rows: RowsWithRings) -> list[str]:

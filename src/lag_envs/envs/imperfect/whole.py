@@ -56,7 +56,7 @@ class WholeProgram(DrawnProgram):
         self._add_pushes(constants)
 
     def _bound_observations(self) -> None:
-        """Leave observations unbounded: what the sensors show is bounded later."""
+        """Leave observations unbounded; the readings of the sensors are bounded later."""
 
     @property
     def _controls(self) -> list[str]:
@@ -95,7 +95,8 @@ class WholeProgram(DrawnProgram):
         perturb = [self._key, *self._load([*self.a, "n"]), *self._actuators.perturb, *self._store(self.a)]
         return [
             *(indented(EACH_LANE, perturb) if delay or self.options.action_noise else []),
-            # Not side by side: each environment has its own slot. One that is to be restarted has none.
+            # The environments do not go side by side, since each has its own slot. An environment that is to
+            # be restarted has none.
             *(
                 indented(EACH_LANE, [
                     self._key, *self._load(["n"]),
