@@ -229,7 +229,7 @@ def assignment_to_self():
     return changed(potential=formula)
 
 
-@mistake("cannot assign to field 'mass'", "declares", "mass: float = parameter")
+@mistake("cannot assign to field 'mass'", "declare the numbers", "mass: float = parameter")
 def numbers_set_by_an_init():
     def init(self, mass=1.0):
         self.mass = mass
@@ -251,7 +251,7 @@ def assignment_to_a_coordinate():
 INVALID = {
     "fourth power of a sum": (
         {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + (v.x - v.y) ** 4},
-        "kinetic; degree 4; two at most",
+        "kinetic; degree 4; at most two",
     ),
     "arguments in another order": (
         {"dissipation": lambda self, v, q, u, xp: 0.5 * self.mass * v.x**2},
@@ -267,11 +267,11 @@ INVALID = {
     ),
     "third degree": (
         {"kinetic": lambda self, q, v, xp: v.x**2 + v.y**2 + v.x**3},
-        "kinetic; degree 3; two at most",
+        "kinetic; degree 3; at most two",
     ),
     "relativity in two terms": (
         {"kinetic": lambda self, q, v, xp: (v.x**2 + v.y**2) / 2 + 3 * v.x**4 / 8},
-        "kinetic; degree 4; two at most",
+        "kinetic; degree 4; at most two",
     ),
     "velocity in a function": (
         {"kinetic": lambda self, q, v, xp: xp.sqrt(1 + v.x**2) + v.y**2},
@@ -381,7 +381,7 @@ DECLARED = {
         "'motor'; has no effect; u.motor",
     ),
     "method of every scene": ({"power": lambda self: 1.0}, "power; another"),
-    "state that lacks a name": ({"state": ("x", "x_dot", "y", "y_dot")}, "state; order of"),
+    "state that lacks a name": ({"state": ("x", "x_dot", "y", "y_dot")}, "state; in some order"),
     "state that is text": ({"state": "x"}, "state; names in order"),
     "rate left out without its place": ({"left_out": ("s_dot",)}, "left_out; 's'; 's_dot'"),
     "left out that is not there": ({"left_out": ("z",)}, "left_out; 'z'"),

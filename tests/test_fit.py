@@ -339,7 +339,9 @@ def test_a_model_that_is_wrong():
     for data, controls in ((-states, torques), (states, -torques)):
         with pytest.raises(ValueError, match=r"^mass=\S+ grew without bound: .* its sign, .* may be wrong$"):
             Pendulum().fit([(noisy(data, 0.01, 1), controls, DT)], list(ROD))
-    with pytest.raises(ValueError, match=r"such as some under known controls.* a control, .* is wrong$"):
+    with pytest.raises(
+        ValueError, match=r"such as recordings under known controls.* a control, .* is wrong$"
+    ):
         Pendulum().fit([(noisy(states, 0.01, 1), None, DT)], list(ROD))
 
 
@@ -444,7 +446,7 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
 @pytest.mark.parametrize(
     ("recordings", "keywords", "message"),
     [
-        ([], {}, "recordings must be a list of .states, controls, dt."),
+        ([], {}, "recordings must be a list of at least one .states, controls, dt."),
         ([(STATES, None)], {}, r"recording 0 must be \(states, controls, dt\), got a tuple of 2$"),
         ([{"states": STATES}], {}, "got a dict$"),
         (STATES, {}, r"a list of at least one \(states, controls, dt\), got an array of shape \(20, 2\)$"),

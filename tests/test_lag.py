@@ -436,7 +436,7 @@ def test_bound_of_a_lagged_step():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"lag": -1.0}, "lag must be 0 or at least 1e-06 of the step of 0.02 s, got -1 s"),
+        ({"lag": -1.0}, "lag must be 0 or at least 1e-06 times the step of 0.02 s, got -1 s"),
         (
             {"lag": 1e-9},
             "lag must be 0 or at least 1e-06 times the step of 0.02 s, got 1e-09 s; 0 means no lag",

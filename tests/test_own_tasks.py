@@ -376,7 +376,7 @@ def _guarded(function, x):
         ({"reward": lambda self, *_: None}, "reward returns None"),
         (
             {"reward": lambda self, b, after, c, t, dt, xp: xp.clip(after.x, 0.0, 1.0)},
-            r"it uses xp.clip; .* write xp.minimum\(xp.maximum\(x, low\), high\)",
+            r"it uses xp.clip, .* write xp.minimum\(xp.maximum\(x, low\), high\)",
         ),
         (
             {"reward": lambda self, b, after, c, t, dt, xp: xp.where(after.x > 0.0, 1.0)},
@@ -391,7 +391,7 @@ def _guarded(function, x):
             r"reward must be reward\(self, before, .*, got \(self, after\)",
         ),
         ({"reward": 0.0}, r"Mistaken.reward must be reward\(self, before, .*, got 0.0"),
-        ({"reward": lambda self, b, after, *a: a[-1].clip(after.x, 0, 1)}, "it uses xp.clip; .* minimum"),
+        ({"reward": lambda self, b, after, *a: a[-1].clip(after.x, 0, 1)}, "it uses xp.clip, .* minimum"),
         ({"reward": lambda self, b, after, *_: math.exp(after.x)}, "write xp.exp for math.exp"),
         ({"reward": lambda self, b, after, *_: np.exp(after.x)}, "write xp.exp"),
         ({"reward": lambda self, *_: self.scene.load_mas}, "no attribute 'load_mas'; did you mean load_mass"),
@@ -417,7 +417,7 @@ def _guarded(function, x):
             {"reward": lambda self, b, after, *_: _guarded(math.acos, after.x)},
             "reward: a function of math, .* the formula catches this error, which it must not",
         ),
-        ({"reward": lambda self, b, after, *_: after.x % 2.0}, r"a % b is a - b \* xp.floor\(a / b\)"),
+        ({"reward": lambda self, b, after, *_: after.x % 2.0}, r"for a % b write a - b \* xp.floor\(a / b\)"),
         ({"reward": lambda self, b, after, *_: round(after.x)}, r"write xp.floor\(x \+ 0.5\)"),
         ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),
         ({"guard": lambda self, wanted, before, dt, xp: {"shove": 1.0}}, "there is no control 'shove'"),
@@ -499,7 +499,7 @@ def _guarded(function, x):
         ({"reward": lambda self, b, after, *_: (after.x > 0) + (b.x > 0)}, "applied to comparisons alone"),
         (
             {"reward": lambda self, b, after, *_: self.scene.energy([*after])["total"]},
-            "reward: a formula calls something derived .* self.scene.kinetic and self.scene.potential",
+            "reward: a formula calls something that is derived .* self.scene.kinetic and self.scene.potential",
         ),
         ({"imperfections": {"lag": -1.0}}, "^Mistaken.imperfections: lag must be 0 or at least .* got -1 s"),
         (
@@ -549,7 +549,7 @@ class Hidden(Scene):
         (
             Pushed,
             "Energetic.reward: there is no velocity of a coordinate 'x', nor any other; the state holds w "
-            "instead, as velocities jump with s_dot; write the formula with w",
+            "instead, because velocities jump with s_dot; write the formula with w",
         ),
         (Hidden, "Energetic.reward: after.v is the place of the coordinate 'v', which hides the velocities"),
     ],

@@ -494,7 +494,7 @@ class SwingUpAnywhere(SwingUp):
     )
     note = """
 The best known method plans on the exact model, at the start and whenever a kick has spoilt the plan. Holding
-the bars alone works only if they happen to pass upright slowly.
+alone works only if the bars happen to pass upright slowly.
 """
 
     @property
