@@ -499,7 +499,7 @@ def _guarded(function, x):
         ({"reward": lambda self, b, after, *_: (after.x > 0) + (b.x > 0)}, "applied to comparisons alone"),
         (
             {"reward": lambda self, b, after, *_: self.scene.energy([*after])["total"]},
-            "reward: a formula calls something that is derived .* self.scene.kinetic and self.scene.potential",
+            "reward: a formula calls something .* self.scene.kinetic and self.scene.potential",
         ),
         ({"imperfections": {"lag": -1.0}}, "^Mistaken.imperfections: lag must be 0 or at least .* got -1 s"),
         (

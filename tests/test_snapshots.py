@@ -147,12 +147,12 @@ def test_every_environment(env_id, keywords):
 # --- snapshots of another environment -----------------------------------------------------------------------
 
 OTHERS = [
-    (ID, {"damping": 0.5}, "damping is 0.5 there, and 0.001 here"),
-    (ID, {"dt": 0.01}, "dt is 0.01 there, and 0.02 here"),
-    (ID, {"duration": 3.0}, "duration is 3.0 there, and 10.0 here"),
-    (ID, ALL, r"observation_noise is \(0.01, 0.0, .*\) there, and \(\) here"),
-    (ID, {"lag": 0.05}, r"lag is \(0.05,\) there, and \(\) here"),
-    (SwingUpFree.id, {}, "task is .*SwingUpFree' there, and .*SwingUp' here"),
+    (ID, {"damping": 0.5}, "damping is 0.5 in the snapshot, and 0.001 here"),
+    (ID, {"dt": 0.01}, "dt is 0.01 in the snapshot, and 0.02 here"),
+    (ID, {"duration": 3.0}, "duration is 3.0 in the snapshot, and 10.0 here"),
+    (ID, ALL, r"observation_noise is \(0.01, 0.0, .*\) in the snapshot, and \(\) here"),
+    (ID, {"lag": 0.05}, r"lag is \(0.05,\) in the snapshot, and \(\) here"),
+    (SwingUpFree.id, {}, "task is .*SwingUpFree' in the snapshot, and .*SwingUp' here"),
     ("CylinderInCylinderPump-v0", {}, "task is .*Pump' there"),
 ]
 
@@ -171,17 +171,17 @@ def test_a_snapshot_of_another_environment_is_refused(env_id, keywords, message)
 def test_other_ranges_are_refused():
     here, other = (gym.make(ID, **ALL | {"randomize": {"mass": (0.5, high)}}) for high in (2.0, 3.0))
     snapshot = snapshots.Snapshot(other.unwrapped._about, {}, *[np.zeros(1)] * 3)
-    with pytest.raises(ValueError, match=r"randomize is .* 3.0, .* there, and .* 2.0, .* here"):
+    with pytest.raises(ValueError, match=r"randomize is .* 3.0, .* in the snapshot, and .* 2.0, .* here"):
         here.unwrapped.set_state(snapshot)
 
 
 def test_other_batches_are_refused():
     here = gym.make_vec(ID, num_envs=3, damping=[0.1, 0.2, 0.3])
     for keywords, message in (
-        ({"num_envs": 4}, "num_envs is 4 there, and 3 here"),
+        ({"num_envs": 4}, "num_envs is 4 in the snapshot, and 3 here"),
         ({"num_envs": 3, "autoreset_mode": "SameStep"}, "autoreset_mode is 'SameStep' there"),
-        ({"num_envs": 3, "max_episode_steps": 7}, "max_episode_steps is 7.0 there, and 500.0 here"),
-        ({"num_envs": 3}, r"damping is 0.001 there, and \(0.1, 0.2, 0.3\) here"),
+        ({"num_envs": 3, "max_episode_steps": 7}, "max_episode_steps is 7.0 in the snapshot, and 500.0 here"),
+        ({"num_envs": 3}, r"damping is 0.001 in the snapshot, and \(0.1, 0.2, 0.3\) here"),
     ):
         other = gym.make_vec(ID, **keywords)
         other.reset(seed=1)
@@ -189,7 +189,7 @@ def test_other_batches_are_refused():
             here.unwrapped.set_state(other.unwrapped.get_state())
     single = gym.make(ID)
     single.reset(seed=1)
-    with pytest.raises(ValueError, match="num_envs is None there, and 3 here"):
+    with pytest.raises(ValueError, match="num_envs is None in the snapshot, and 3 here"):
         here.unwrapped.set_state(single.unwrapped.get_state())
     with pytest.raises(TypeError, match="set_state takes what get_state returned, got 3"):
         here.unwrapped.set_state(3)

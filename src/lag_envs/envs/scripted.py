@@ -117,8 +117,8 @@ class UnfusedProgram:
     def __init__(self, task: Task, single: bool = False) -> None:
         if task.imperfections:
             raise FormulaError(
-                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which "
-                "scripts lack; switch them off with None, as in observation_noise=None"
+                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which this "
+                "script does not support; switch them off with None, as in observation_noise=None"
             )
         self.task, formulas, scene = task, task.formulas, task.scene
         self._formulas, self._form, self._stepper = formulas, form_of(scene), stepper_of(scene.mechanics)

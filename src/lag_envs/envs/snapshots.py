@@ -68,11 +68,11 @@ def check_snapshot(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) 
         there = snapshot.about.get(name), name in snapshot.about
         if there != (here.get(name), name in here):
             raise ValueError(
-                f"this is a snapshot of another environment: {name} is {shown(there[0])} there, and "
-                f"{shown(here.get(name))} here"
+                f"this is a snapshot of another environment: {name} is {shown(there[0])} in the snapshot, "
+                f"and {shown(here.get(name))} here"
             )
     if set(rows) != set(snapshot.rows):
-        raise ValueError("this snapshot was made by another version of lag_envs: its numbers differ in kind")
+        raise ValueError("this snapshot was made by another version of lag_envs and has other numbers")
 
 
 def _common(values: list[Any]) -> Any:

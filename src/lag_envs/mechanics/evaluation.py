@@ -41,7 +41,7 @@ class Exact:
 
 
 def exactly(parameters: Mapping[str, float]) -> dict[Atom, Any]:
-    """Return the parameters' values by symbol, as fractions: `evaluate` rounds results once."""
+    """Return the parameters' values by symbol, as fractions, so that `evaluate` rounds results once."""
     return {
         parameter(name): Fraction(value) if math.isfinite(value) else np.float64(value)
         for name, value in parameters.items()
@@ -111,7 +111,7 @@ class DualArray:
         if isinstance(other, DualArray):
             slope = self.value[..., None] * other.slope + other.value[..., None] * self.slope
             return DualArray(self.value * other.value, slope)
-        factor = np.asarray(other, dtype=np.float64)  # whole numbers beyond 64 bits would make objects
+        factor = np.asarray(other, dtype=np.float64)  # larger whole numbers would make objects
         return DualArray(self.value * factor, factor[..., None] * self.slope)
 
     __rmul__ = __mul__
@@ -150,7 +150,7 @@ RATES: Mapping[str, Callable[[Any, Any, Any], Any]] = {
 
 
 def _slope_of_tanh(x: Any, xp: Any) -> Any:
-    """Return 1 - tanh², with all digits also where tanh is nearly 1."""
+    """Return 1 - tanh², with all digits even where tanh is nearly 1."""
     fading = xp.exp(-2.0 * abs(x))
     grown = 1.0 + fading
     return 4.0 * fading / (grown * grown)
@@ -219,7 +219,7 @@ class MotionPoint:
         parameters : mapping from Atom to float
             The parameters' values.
         state, controls : sequence of numbers
-            By entry: numbers, arrays that broadcast, or `DualArray` numbers.
+            The entries: numbers, arrays that broadcast, or `DualArray` numbers.
         xp : namespace
             Functions for these numbers.
         """
@@ -262,7 +262,7 @@ class MotionPoint:
         return total
 
     def solve(self, right: Sequence) -> list:
-        """Return M⁻¹ times a column; a state with a singular M gets no finite number, all others do."""
+        """Return M⁻¹ times a column; only states with a singular M get numbers that are not finite."""
         n = len(right)
         return eliminated([self.mass[n * i : n * (i + 1)] for i in range(n)], right)
 
@@ -315,7 +315,8 @@ class MotionPoint:
         speeds = [self.values[velocity(name)] for name in moving]
         drive = sum(f * self.values[velocity(m)] for m, f in zip(carried, self.force(carried), strict=True))
         for m in (p.name for p in layout.at("acceleration") if p.name not in carried):
-            # If a coordinate's rate is left out, its acceleration acts as a field in the coordinate's frame.
+            # If the rate of a coordinate is left out, its acceleration acts as a field in the coordinate's
+            # frame.
             full = self.mechanics.full
             row = full.coordinates.index(m)
             fields = self.of([full.entry(full.coordinates.index(name), row) for name in moving])

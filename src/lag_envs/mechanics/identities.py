@@ -12,8 +12,8 @@ from lag_envs.mechanics.algebra import Atom, Expr, Monomial, function_of, opened
 def apply_identities(expr: Expr) -> Expr:
     """Apply cos² + sin² = 1, and the addition formulas of cosine and sine, to terms that match.
 
-    Two terms match if they agree in all but a pair of factors and their coefficients have the same size. So
-    energies written in Cartesian velocities become as short as those written in angles.
+    Two terms match if they agree in all but a pair of factors and their coefficients have the same size. As a
+    result, energies written in Cartesian velocities become as short as energies written in angles.
     """
     terms = dict(expr.terms)
     while True:
@@ -32,8 +32,8 @@ def apply_identities(expr: Expr) -> Expr:
 def shorter(energy: Expr) -> Expr:
     """Return an energy with its sums multiplied out if that leaves fewer terms that move.
 
-    They may meet by cos² + sin² = 1, as in the squared distance of two points. Sums inside functions stay
-    whole: under a root the constant counts, and digits would be lost.
+    Terms may combine by cos² + sin² = 1, as in the squared distance of two points. Sums inside functions stay
+    whole: under a root the constant matters, and digits would be lost.
     """
     multiplied = opened(energy)
     if multiplied.same(energy):
@@ -48,7 +48,7 @@ def _moving(expr: Expr) -> int:
 
 
 def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, int | Fraction]] | None:
-    """Return the changes of terms that one rule makes, or None if none applies."""
+    """Return the changes of terms that one rule makes, or None if no rule applies."""
     for monomial in sorted(terms, key=lambda m: [(a.text, n) for a, n in m]):
         c = terms[monomial]
         waves = [(a, n) for a, n in monomial if a.function in ("sin", "cos")]

@@ -1,8 +1,8 @@
 """A scene's declarations: coordinates, controls and state, with every name and unit checked or derived.
 
-Of units only ``rad`` has a meaning: a coordinate with it is an angle. The name of a control decides what it
-does: ``s_ddot``, ``s_dot`` or ``s`` moves a prescribed coordinate ``s``. The unit of a rate is that of the
-coordinate with ``/s`` appended.
+The only unit with a meaning is ``rad``: a coordinate in this unit is an angle. The name of a control decides
+what it does: ``s_ddot``, ``s_dot`` or ``s`` moves a prescribed coordinate ``s``. The unit of a rate is that
+of the coordinate with ``/s`` appended.
 """
 
 from __future__ import annotations

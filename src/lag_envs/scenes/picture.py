@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 GROUND = "ground"
 INSTEAD_OF_SHAPES = (
     "a picture is drawn from shapes in frames and from the frames' places; return the shapes by frame from "
-    "bodies(self), where bodies are from poses(self, q, xp), and where arrows, targets and the like are from "
-    "indicators(self, now, xp)"
+    "bodies(self), the places of bodies from poses(self, q, xp), and the places of arrows, targets and the "
+    "like from indicators(self, now, xp)"
 )
 
 

@@ -165,7 +165,7 @@ def from_sympy(
             pairs = [(_symbol(key), value) for key, value in dict(given).items()]
         except (TypeError, ValueError):
             raise FormulaError(
-                f"{name}.{what} must be a dict from SymPy symbols, got {given!r:.60}"
+                f"{name}.{what} must be a dict with SymPy symbols as keys, got {given!r:.60}"
             ) from None
         for i, (key, value) in enumerate(pairs):
             if what == "parameters" and not callable(value):

@@ -110,9 +110,7 @@ class SeriesStepper:
         given = self._state(y)
         known = {f"start_{name}": value for name, value in given.items()} | self._inputs(xp, u)
         inputs = {name: known[name] for name in self._whole.inputs if name in known}
-        q = [
-            given.get(name, 0.0) for name in self._layout.free
-        ]  # places left out do not matter
+        q = [given.get(name, 0.0) for name in self._layout.free]  # places left out do not matter
         driven = {p.name: given.get(p.name) for p in self._layout.prescribed}
         shift = self._shift(xp, q, driven, self._starting(xp, u), k)
         for i, name in enumerate(self._layout.free):

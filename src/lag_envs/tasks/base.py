@@ -228,8 +228,8 @@ class Task:
         if not 1e-6 <= self.dt <= 1.0:
             name = f"{of}.interval" if dt is None else "dt"
             raise ValueError(
-                f"{name} must lie between 1e-6 and 1 s, got {self.dt:g} s; for other motions write "
-                "all numbers of scene and task in another unit of time"
+                f"{name} must lie between 1e-6 and 1 s, got {self.dt:g} s; for faster or slower motions "
+                "write all numbers of scene and task in another unit of time"
             )
         steps = check_number(f"{of}.steps", self.steps, endless=True)
         if steps != math.inf and steps % 1.0:

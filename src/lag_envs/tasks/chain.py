@@ -104,7 +104,7 @@ class SwingUp(GuardedTrack, _ChainTask):
     ## Starting State
 
     The chain hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused.
-    The half width of s is a tenth of the track's.
+    At the start, s lies within a tenth of the track's half length.
 
     ## Episode End
 
@@ -433,7 +433,7 @@ class SwingUpAnywhere(SwingUp):
     ## Starting State
 
     The angles are arbitrary, and the bars move. Starts from which the support cannot stop inside the track
-    are refused. The half width of s is a tenth of the track's.
+    are refused. At the start, s lies within a tenth of the track's half length.
 
     After each step, with probability 0.005 (1 - 0.995^(dt/0.02) for another `dt`), a kick changes the last
     bar's rate by a uniform amount within ±1 rad/s.

@@ -69,8 +69,8 @@ class SwingUp(GuardedTrack, _Bar):
 
     ## Starting State
 
-    The bar hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused. The
-    half width of s is a tenth of the track's.
+    The bar hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused. At
+    the start, s lies within a tenth of the track's half length.
 
     ## Episode End
 
