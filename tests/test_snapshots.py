@@ -153,7 +153,7 @@ OTHERS = [
     (ID, ALL, r"observation_noise is \(0.01, 0.0, .*\) in the snapshot, and \(\) here"),
     (ID, {"lag": 0.05}, r"lag is \(0.05,\) in the snapshot, and \(\) here"),
     (SwingUpFree.id, {}, "task is .*SwingUpFree' in the snapshot, and .*SwingUp' here"),
-    ("CylinderInCylinderPump-v0", {}, "task is .*Pump' there"),
+    ("CylinderInCylinderPump-v0", {}, "task is .*Pump' in the snapshot"),
 ]
 
 
@@ -179,7 +179,7 @@ def test_other_batches_are_refused():
     here = gym.make_vec(ID, num_envs=3, damping=[0.1, 0.2, 0.3])
     for keywords, message in (
         ({"num_envs": 4}, "num_envs is 4 in the snapshot, and 3 here"),
-        ({"num_envs": 3, "autoreset_mode": "SameStep"}, "autoreset_mode is 'SameStep' there"),
+        ({"num_envs": 3, "autoreset_mode": "SameStep"}, "autoreset_mode is 'SameStep' in the snapshot"),
         ({"num_envs": 3, "max_episode_steps": 7}, "max_episode_steps is 7.0 in the snapshot, and 500.0 here"),
         ({"num_envs": 3}, r"damping is 0.001 in the snapshot, and \(0.1, 0.2, 0.3\) here"),
     ):
