@@ -647,11 +647,11 @@ def test_symbols_of_sympys_expressions_that_only_look_alike():
     [
         ("lambda", "a keyword of Python"),
         ("class", "a keyword of Python"),
-        (r"\theta", "no name; use letters, digits"),
-        ("theta ", "no name"),
-        ("1a", "no name"),
-        ("a'", "no name"),
-        ("mu_{k}", "no name"),
+        (r"\theta", "not a name; use letters, digits"),
+        ("theta ", "not a name"),
+        ("1a", "not a name"),
+        ("a'", "not a name"),
+        ("mu_{k}", "not a name"),
     ],
 )
 def test_parameters_of_sympys_expressions_that_are_no_names(name, why):

@@ -125,7 +125,7 @@ def test_a_window_that_nobody_sees_is_not_opened(monkeypatch):
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     monkeypatch.setattr(pygame.display, "init", lambda: None)
     monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
-    with pytest.raises(gym.error.Error, match="no display here; `lag-envs watch ID --video FILE`"):
+    with pytest.raises(gym.error.Error, match="no display was found; `lag-envs watch ID --video FILE`"):
         screen.check_display()
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     screen.check_display()
