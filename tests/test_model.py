@@ -83,7 +83,7 @@ def test_a_refusal_names_the_applied_control():
             model([[1.0, 0.0], [-1.0, 0.0]], [0.0, action])
     states, message = (
         [[1.0, 0.0], [4.0, 0.0]],
-        "the step of row 1 .* with f=nan .* if the task has a guard, look",
+        "the step of row 1 .* with f=nan .* if the task has a guard, check",
     )
     with pytest.raises(StepRefused, match=message):
         model(states, [0.0, 0.0])
