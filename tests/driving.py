@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from browsers import until
 from driven import Six
+from later_policies import numbers
 from own_tasks import TASKS as OWN
-from test_policies import numbers
 
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import SubmittedPolicy, architecture

@@ -1,7 +1,21 @@
 """Recorded operations, and the step of a series, carried out on Python's floats."""
 
+import math
+import types
+
+import numpy as np
+
+from lag_envs.stepping import compiling, driver
+from lag_envs.stepping.machine import LaneLayout
+from lag_envs.stepping.series import TOLERANCE, Series, StepProgress
 from lag_envs.stepping.target import GROUP, elementary
 from lag_envs.stepping.tracing import IEEE
+
+#: The functions of formulas for floats.
+FLOATS = types.SimpleNamespace(
+    number=float,
+    **{name: getattr(math, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan", "tanh")},
+)
 
 
 def evaluate_operations(operations, values):
@@ -121,3 +135,47 @@ class Plain:
 
     def scalars(self, record, inputs):
         return evaluate_operations(record.scalars, inputs)
+
+
+def in_python(name, source, *helpers, inner=False, **constants):
+    """Replace `compile_function`: run the source in Python, and the recorded operations too."""
+
+    def block(operations, inputs, outputs):
+        def run(*values):
+            known = evaluate_operations(operations, dict(zip(inputs, values, strict=True)))
+            return tuple(known[name] for name in outputs)
+
+        return run
+
+    def read_rows(array, first, stride, rows):
+        return tuple(array[first + row * stride] for row in rows)
+
+    def write_rows(array, first, stride, rows, numbers):
+        for row, number in zip(rows, numbers, strict=True):
+            array[first + row * stride] = number
+
+    numpy = types.SimpleNamespace(zeros=lambda n: [0.0] * n, int64=int)
+    scope = {"np": numpy, "read_rows": read_rows, "write_rows": write_rows}
+    scope |= constants | {helper.__name__: helper for helper in helpers}
+    scope |= {name: block(*parts) for name, parts in compiling._blocks.items()}
+    exec(source, scope)
+    return scope[name]
+
+
+def advance_in_python(record, tolerance=TOLERANCE, fused=False):
+    """Replace `compile_advance`: the driver's own code on `Plain`."""
+    series, layout, n = Series(record), LaneLayout(record), record.size
+
+    def attempt(rows, at, order, tolerance):
+        given = {name: rows[row] for name, row in layout.inputs.items()}
+        q, v = (list(rows[first : first + n]) for first in (layout.q, layout.v))
+        lane = StepProgress(q, v, *rows[layout.status : layout.span])
+        dt = rows[layout.span]
+        after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
+        rows[layout.q : layout.span] = [*after.q, *after.v, after.attempts, after.left, after.wish]
+        for row, bound in enumerate(bounds, layout.bounds):
+            rows[row] += bound
+        return not after.left > 0.0
+
+    names = driver._numbers(record, tolerance) | {"attempt": attempt, "np": np}
+    return types.FunctionType(driver._advance.__code__, names, "advance_lane")

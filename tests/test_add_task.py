@@ -11,10 +11,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from batches import assert_alike, assert_same, pair
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
 from scipy.integrate import solve_ivp
-from test_vector import assert_alike, assert_same, pair
 from toy_pendulum import Pendulum, Swing
 
 from agents import behaviour, results, scale, submit, train

@@ -10,7 +10,7 @@ import own_tasks
 import pytest
 from contract_scenes import Crane, Functions, RotatingFrame, Top
 from covering import covering, slow, way
-from test_jacobian import exact_step
+from reference import exact_step
 
 from lag_envs.envs.model import Model
 from lag_envs.envs.vector import LagrangianVectorEnv

@@ -21,11 +21,11 @@ from driving import (
     reading,
     shows,
 )
+from later_policies import EVERY as LATER
+from later_policies import LISTED, LISTS, TwoLists
+from later_policies import OWN as LATER_TASKS
 from own_tasks import TASKS as OWN
 from own_tasks import Switched
-from test_policies import EVERY as LATER
-from test_policies import LISTED, LISTS, TwoLists
-from test_policies import OWN as LATER_TASKS
 
 from lag_envs import register, replay
 from lag_envs.controllers import controllers

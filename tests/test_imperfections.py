@@ -10,8 +10,8 @@ import gymnasium as gym
 import numpy as np
 import own_tasks
 import pytest
+from batches import ALL, ID, played
 from covering import slow
-from test_vector import assert_same, pair
 
 import lag_envs
 from lag_envs import replay
@@ -33,40 +33,6 @@ from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks import TASKS, Task, pivoted_bar
 from lag_envs.tasks.imperfections import KEYWORDS, LARGEST_NORMAL, MARGIN
 from lag_envs.tasks.registration import make_task
-
-ID = "PivotedBar-v0"
-#: Every keyword, with a range and a size of its own.
-ALL = {
-    "randomize": {"damping": (0.1, 10, "log"), "com_distance": (0.15, 0.6, "absolute")},
-    "observation_noise": {"s/S": 0.01, "cos(theta)": 0.02, "sin(theta)": 0.02, "theta_dot/8": 0.05},
-    "observation_delay": 0.03,
-    "observation_every": 2,
-    "action_noise": 0.1,
-    "action_delay": (0.0, 0.05),
-    "slew": 100.0,
-    "lag": 0.01,
-    "push": (4.0, 0.7),
-}
-
-
-def played(env_id: str, n: int, steps: int, mode: str = "NextStep", **keywords):
-    """Assert that a batch equals single environments, bit for bit; return the observations."""
-    envs, sync = pair(env_id, n, mode, **keywords)
-    own, alone, seen = envs.unwrapped, [env.unwrapped for env in sync.envs], []
-    assert_same(envs.reset(seed=5), sync.reset(seed=5))
-    for _ in range(steps):
-        actions = envs.action_space.sample()
-        if not own.task.formulas.choices:
-            actions *= np.float32(1.5)  # some are clipped
-        found = envs.step(actions)
-        assert_same(found, sync.step(actions))
-        assert all(envs.single_observation_space.contains(one) for one in found[0])
-        assert np.array_equal(own.state, [env.state for env in alone])
-        assert np.array_equal(own.control, [env.control for env in alone])
-        for name, values in own.parameters.items():
-            assert np.array_equal(values, [env.parameters[name] for env in alone])
-        seen.append(found[0])
-    return np.array(seen), envs
 
 
 @pytest.mark.slow

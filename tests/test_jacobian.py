@@ -5,17 +5,14 @@ import math
 import mpmath
 import numpy as np
 import pytest
-import sympy
 from contract_scenes import ChargedParticle, RotatingHoop, Trolley
 from covering import slow
-from mpmath.libmp import to_rational
-from reference import flow, random_cases
+from reference import exact_step, flow, random_cases
 from series_systems import SYSTEMS
 
 from lag_envs import scenes
 from lag_envs.envs.model import Model
 from lag_envs.mechanics.recording import parameter_values
-from lag_envs.report.oracle import Oracle
 from lag_envs.scenes import (
     Acrobot,
     CartPole,
@@ -49,15 +46,6 @@ CASES = {
         if system.name in ("acrobot", "elastic pendulum", "lattice")
     },
 }
-
-
-def exact_step(scene, state, control, dt, moved=None):
-    """Return the state after a step in 36 digits, by the report's oracle, which shares no code with the step.
-
-    Parameters in `moved` have other values than the scene's, as numbers of mpmath.
-    """
-    exact = {name: sympy.Rational(*to_rational(value._mpf_)) for name, value in (moved or {}).items()}
-    return mpmath.matrix(Oracle(scene, exact).once(state, control, dt, 36))
 
 
 @pytest.mark.parametrize("case", [case if case == "cart_pole" else slow(case) for case in CASES])

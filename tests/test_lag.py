@@ -14,11 +14,10 @@ import mpmath
 import numpy as np
 import own_tasks
 import pytest
+from batches import played
 from contract_scenes import Functions, Trolley
 from covering import slow
-from plain_target import Plain, evaluate_operations
-from test_imperfections import played
-from test_series import advance_in_python, in_python
+from plain_target import Plain, advance_in_python, evaluate_operations, in_python
 
 import lag_envs
 from lag_envs.report.oracle import oracle_of

@@ -5,9 +5,9 @@ import pytest
 import sympy
 from covering import every, slow
 from mpmath import mp, mpf
+from plain_target import FLOATS
 from reference import conditioning, flow, moving_plane, random_cases, scales
 from series_systems import SYSTEMS, acceleration
-from test_series import FLOATS
 
 from lag_envs import scenes
 from lag_envs.report import formulas, reference

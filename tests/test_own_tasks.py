@@ -13,10 +13,10 @@ import gymnasium as gym
 import numpy as np
 import own_tasks
 import pytest
+from batches import assert_alike, assert_same, pair
 from covering import slow
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
-from test_vector import assert_alike, assert_same, pair
 
 import lag_envs
 from lag_envs.envs.single import LagrangianEnv

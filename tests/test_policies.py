@@ -6,7 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from own_tasks import Switched
+from later_policies import EVERY, LISTED, LISTS, NET, OWN, PLAN, RANGES, UNIT, numbers
 from rollouts import one_by_one
 
 from lag_envs import register
@@ -22,56 +22,14 @@ from lag_envs.leaderboard.policies import ARCHITECTURES, SubmittedPolicy, archit
 from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.leaderboard.verify import record_again, verify
 from lag_envs.scenes import TwoLinkArm
-from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 from lag_envs.tasks.arm import Reach
-from lag_envs.tasks.record import Goal
 
 BOARD = Board(Path(__file__).parents[1] / "leaderboard")
-GOAL = Goal("success: always; there is no time", hold=None, terminated=None)
 ABOUT = {"name": "An agent", "authors": ["A. Nobody"], "license": "MIT"}
 TRAINING = {"env_steps": 1000, "seconds": 2.5, "hardware": "abacus"}
-NET = {"architecture": "mlp", "hidden": [3], "squash": "clip"}
-PLAN = {"architecture": "plan"}
 AHEAD = {"architecture": "mpc", "horizon": 25, "guesses": 4, "budget": 2_000}
 BEAM = {"architecture": "mpc", "horizon": 20, "budget": 4_000}
-UNIT = {"architecture": "gru", "memory": 5, "squash": "tanh"}
-
-
-class OneOfThree(Switched):
-    """One list of actions."""
-
-    id = "OneOfThree-v0"
-    goal = GOAL
-
-
-class Arm(Task):
-    """Two controls in ranges."""
-
-    id = "ArmWithGoal-v0"
-    scene = TwoLinkArm
-    interval, steps = 0.02, 40
-    action = {"shoulder": 5.0, "elbow": 2.0}
-    start = {"theta_1": 0.5, "theta_2": 0.5}
-    goal = GOAL
-
-    def observe(self, after, target, xp):
-        one, two = after.theta_1, after.theta_2
-        angles = {"cos_1": xp.cos(one), "sin_1": xp.sin(one), "cos_2": xp.cos(two), "sin_2": xp.sin(two)}
-        return angles | {name: after[name] for name in ("theta_1_dot", "theta_2_dot")}
-
-    def reward(self, before, after, control, target, dt, xp):
-        return xp.cos(after.theta_1) - 1e-3 * control.shoulder**2
-
-
-class TwoLists(Arm):
-    """Two lists of actions."""
-
-    id = "TwoLists-v0"
-    action = {"shoulder": [-5.0, 0.0, 5.0], "elbow": [-2.0, 2.0]}
-
-
-OWN = (OneOfThree, Arm, TwoLists)
-LISTED, RANGES, LISTS = (kind.id for kind in OWN)
 
 
 @pytest.fixture(autouse=True)
@@ -80,15 +38,6 @@ def boards(monkeypatch):
     for kind in OWN:
         monkeypatch.setitem(TASKS.data, kind.id, kind)
         register(kind)
-
-
-def numbers(env, policy, seed=0):
-    """Return arrays of the right shapes, of plans of nine steps."""
-    rng = np.random.default_rng(seed)
-    lengths = {"steps": 9, "steps + 1": 10}
-    shapes = architecture(env, policy).arrays.items()
-    drawn = {name: rng.uniform(-1.0, 1.0, [lengths.get(n, n) for n in shape]) for name, shape in shapes}
-    return drawn | ({"obs_var": np.abs(drawn["obs_var"])} if "obs_var" in drawn else {})
 
 
 def agent(env, policy, seed=0):
@@ -111,22 +60,6 @@ def seen(env, n, steps=6):
     envs.action_space.seed(3)
     first, _ = envs.reset(seed=5)
     return np.array([first, *(envs.step(envs.action_space.sample())[0] for _ in range(steps - 1))])
-
-
-EVERY = [
-    (incline.Tilt.id, NET | {"frames": 3, "normalise": {}}),
-    (incline.Tilt.id, UNIT | {"hidden": [4], "normalise": {"clip": 0.5}}),
-    (incline.Tilt.id, UNIT | {"squash": None, "bins": 7}),
-    (incline.Tilt.id, {"architecture": "plan"}),
-    (LISTED, {"architecture": "mlp", "hidden": [4]}),
-    (LISTED, {"architecture": "linear"}),
-    (LISTED, {"architecture": "gru", "memory": 3}),
-    (RANGES, UNIT),
-    (RANGES, {"architecture": "plan"}),
-    (LISTS, {"architecture": "mlp", "hidden": [], "frames": 2, "padding": "first"}),
-    (LISTS, {"architecture": "linear"}),
-]  # fmt: skip
-EVERY = [(env, {key: value for key, value in policy.items() if value is not None}) for env, policy in EVERY]
 
 
 @pytest.mark.parametrize(("env", "policy"), EVERY)

@@ -2,8 +2,6 @@
 
 import json
 import re
-from concurrent.futures import Future
-from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from covering import slow
-from trainings import go, kill_and_interrupt, short_evaluations
+from trainings import OTHERS, go, here, kill_and_interrupt, short_evaluations
 
 import lag_envs
 from agents import learners, ppo, race, submit, train, tune
@@ -31,10 +29,6 @@ ROOT = Path(__file__).parents[1]
 ENV = pivoted_bar.SwingUpFree.id
 #: For trainings that take a fraction of a second.
 SHORT = {"n_envs": 8, "n_steps": 16, "n_epochs": 2, "batch_size": 64}
-OTHERS = {
-    "shac": {"n_envs": 8, "n_steps": 16, "critic": [8]},
-    "cloning": {"n_envs": 8, "n_steps": 16, "n_updates": 2, "batch_size": 8},
-}
 
 
 class Puck(Scene):
@@ -110,23 +104,6 @@ def learnt(run):
         [(s, r) for s, _, r in result["curve"]],
         result["trained"],
     )
-
-
-@contextmanager
-def here(count, begin=None, *given):
-    """Work in this process instead of others."""
-    if begin:
-        begin(*given)
-
-    def submit(function, *arguments):
-        future = Future()
-        try:
-            future.set_result(function(*arguments))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-    yield submit
 
 
 # --- runs ---

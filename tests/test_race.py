@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from test_ppo import here
+from trainings import here
 
 from agents import race, run, tune
 from agents.run import UserError

@@ -20,7 +20,7 @@ from contract_scenes import ElasticPendulum, Trolley
 from covering import every, slow
 from llvmlite import binding, ir
 from mpmath import mp, mpf
-from plain_target import Plain, evaluate_operations
+from plain_target import FLOATS, Plain, advance_in_python, in_python
 from series_systems import POINTS, SYSTEMS, System
 
 from lag_envs.mechanics.recording import parameter_values
@@ -40,14 +40,9 @@ from lag_envs.stepping.series import (
     TOLERANCE,
     TRIES,
     Series,
-    StepProgress,
 )
 
 NAMES = [system.name for system in SYSTEMS]
-FLOATS = types.SimpleNamespace(
-    number=float,
-    **{name: getattr(math, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan", "tanh")},
-)
 
 
 # --- exact series -------------------------------------------------------------------------------------------
@@ -393,50 +388,6 @@ def simulate(scene, start, controls, dt, order, fused=True):
         trajectory, controls = trajectory.astype(object), np.array(controls, dtype=object)
     assert not run(trajectory, np.asarray(controls), dt, order, *given)
     return trajectory
-
-
-def in_python(name, source, *helpers, inner=False, **constants):
-    """Replace `compile_function`: run the source in Python, and the recorded operations too."""
-
-    def block(operations, inputs, outputs):
-        def run(*values):
-            known = evaluate_operations(operations, dict(zip(inputs, values, strict=True)))
-            return tuple(known[name] for name in outputs)
-
-        return run
-
-    def read_rows(array, first, stride, rows):
-        return tuple(array[first + row * stride] for row in rows)
-
-    def write_rows(array, first, stride, rows, numbers):
-        for row, number in zip(rows, numbers, strict=True):
-            array[first + row * stride] = number
-
-    numpy = types.SimpleNamespace(zeros=lambda n: [0.0] * n, int64=int)
-    scope = {"np": numpy, "read_rows": read_rows, "write_rows": write_rows}
-    scope |= constants | {helper.__name__: helper for helper in helpers}
-    scope |= {name: block(*parts) for name, parts in compiling._blocks.items()}
-    exec(source, scope)
-    return scope[name]
-
-
-def advance_in_python(record, tolerance=TOLERANCE, fused=False):
-    """Replace `compile_advance`: the driver's own code on `Plain`."""
-    series, layout, n = Series(record), LaneLayout(record), record.size
-
-    def attempt(rows, at, order, tolerance):
-        given = {name: rows[row] for name, row in layout.inputs.items()}
-        q, v = (list(rows[first : first + n]) for first in (layout.q, layout.v))
-        lane = StepProgress(q, v, *rows[layout.status : layout.span])
-        dt = rows[layout.span]
-        after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
-        rows[layout.q : layout.span] = [*after.q, *after.v, after.attempts, after.left, after.wish]
-        for row, bound in enumerate(bounds, layout.bounds):
-            rows[row] += bound
-        return not after.left > 0.0
-
-    names = driver._numbers(record, tolerance) | {"attempt": attempt, "np": np}
-    return types.FunctionType(driver._advance.__code__, names, "advance_lane")
 
 
 #: Scenes with states and controls that take several substeps; the last holds two rates.

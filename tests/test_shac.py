@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from covering import slow
-from test_ppo import OTHERS
+from trainings import OTHERS
 
 from agents import cloning, shac, train
 from agents.learners import zoo_hyperparameters

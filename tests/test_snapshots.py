@@ -10,9 +10,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from batches import ALL, ID
 from covering import covering, slow
 from gymnasium.error import ResetNeeded
-from test_imperfections import ALL, ID
 
 from lag_envs.envs import snapshots
 from lag_envs.scenes import StepRefused

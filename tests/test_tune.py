@@ -5,7 +5,7 @@ import os
 import signal
 
 import pytest
-from test_ppo import here
+from trainings import here
 
 from agents import tune
 from lag_envs.tasks import incline

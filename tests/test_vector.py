@@ -10,6 +10,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
+from batches import assert_alike, assert_same, pair
 from covering import IMPERFECT, PERFECT, covering, engine, features, quick, slow, way
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
@@ -41,15 +42,6 @@ def lasting(env_id, steps):
     return {"duration": min(steps, TASKS[env_id].steps) * TASKS[env_id].interval}
 
 
-def pair(env_id, n, mode="NextStep", **options):
-    """Return the native vector environment and Gymnasium's of the single one."""
-    sync = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode(mode)}}
-    return (
-        gym.make_vec(env_id, num_envs=n, autoreset_mode=mode, **options),
-        gym.make_vec(env_id, num_envs=n, disable_env_checker=True, **sync, **options),
-    )
-
-
 def lanes(env_id):
     """Return the size of the record's batch with mixed parameters."""
     (number,) = {len(values) for values in TASKS[env_id].examples.batch.values()}
@@ -71,50 +63,6 @@ def mixed_pair(env_id, mode="NextStep", **options):
     return gym.make_vec(
         env_id, num_envs=lanes(env_id), autoreset_mode=mode, **TASKS[env_id].examples.batch, **options
     ), sync
-
-
-def assert_same(a, b):
-    """Compare infos, observations, rewards, flags: the same keys, types of numbers and bits."""
-    if isinstance(a, dict):
-        assert isinstance(b, dict) and a.keys() == b.keys()
-        for key in a:
-            assert_same(a[key], b[key])
-    elif isinstance(a, tuple):
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    elif isinstance(a, np.ndarray) and a.dtype != object:
-        assert a.dtype == b.dtype and a.shape == b.shape
-        assert a.tobytes() == b.tobytes(), np.argwhere(a != b)
-    elif isinstance(a, np.ndarray):
-        assert b.dtype == object
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    else:
-        assert a is b is None
-
-
-def assert_alike(native, sync, steps, seed=0):
-    """Step both alike, return the number of ended episodes.
-
-    With autoreset disabled, finished episodes are reset, and now and then others too: rarely enough that half
-    of the episodes reach their end.
-    """
-    n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
-    stray = 0.5 / native.task.limit
-    rng = np.random.default_rng(seed)
-    given = actions(steps, native.action_space, seed=seed)
-    ends = 0
-    for action in given:
-        mine, synced = native.step(action), sync.step(action)
-        assert_same(mine, synced)
-        over = mine[2] | mine[3]
-        ends += over.sum()
-        mask = over | (rng.random(n) < stray)
-        if disabled and mask.any():
-            seeds = [int(rng.integers(1000)) if rng.random() < 0.2 else None for _ in range(n)]
-            # Gymnasium's removes the mask from the dict.
-            assert_same(*(e.reset(seed=seeds, options={"reset_mask": mask.copy()}) for e in (native, sync)))
-    return ends
 
 
 # --- the same bits ---

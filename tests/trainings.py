@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,11 @@ import pytest
 from agents import learners
 
 ROOT = Path(__file__).parents[1]
+#: Settings of a short training, for learners with other settings than PPO.
+OTHERS = {
+    "shac": {"n_envs": 8, "n_steps": 16, "critic": [8]},
+    "cloning": {"n_envs": 8, "n_steps": 16, "n_updates": 2, "batch_size": 8},
+}
 
 
 def short_evaluations(episodes):
@@ -58,3 +65,20 @@ def kill_and_interrupt(*arguments):
     assert process.returncode == 130, output
     assert "To resume:" in output
     return output
+
+
+@contextmanager
+def here(count, begin=None, *given):
+    """Work in this process instead of others."""
+    if begin:
+        begin(*given)
+
+    def submit(function, *arguments):
+        future = Future()
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    yield submit
