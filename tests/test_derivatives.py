@@ -9,7 +9,7 @@ import numpy as np
 import own_tasks
 import pytest
 from contract_scenes import Crane, Functions, RotatingFrame, Top
-from covering import covering, slow, way
+from covering import covering, every, slow, way
 from reference import exact_step
 
 from lag_envs.envs.model import Model
@@ -205,6 +205,7 @@ def rounds(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_a_gradient_that_cancels_does_not_divide_the_step(rounds):
     """The motor turns both alike, so the sum does not depend on it; what is left out is small beside each."""
     states, seeds = np.tile([0.7, 1.0], (40, 2)), np.tile([1.0, 0.5], (40, 2))
@@ -231,6 +232,7 @@ def test_rows_that_reverse_mode_gives_up(rounds, monkeypatch):
     np.testing.assert_allclose(found, np.einsum("ni,nij->nj", seeds, ways), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_angle_that_no_formula_needs_may_be_large():
     """That of a top about the vertical; refused is an angle of which sine and cosine are needed."""
     far, seeds = 1e9, np.array([0.0, 1.0, 0.3, -0.2, 0.1, 0.5])
@@ -307,9 +309,12 @@ def starts(task, rng, n):
     return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
 
 
-@pytest.mark.parametrize("env_id", covering(SMOOTH, of=way))
+@pytest.mark.parametrize("env_id", every(len(SMOOTH), SMOOTH))
 def test_whole_step(env_id):
-    """Along a random direction of state, actions and parameters, at starts and where guards and clips act."""
+    """Along a random direction of state, actions and parameters, at starts and where guards and clips act.
+
+    The quick one is a flow; `test_last_rewards` begins with the general series.
+    """
     task, rng, n = TASKS[env_id](), seeded(env_id), 3
     scene, names = task.scene, finite(task.scene)
     model, states, actions, given = starts(task, rng, n)

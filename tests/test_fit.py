@@ -130,7 +130,8 @@ def test_two_coordinates_of_which_only_the_places_are_measured():
     assert np.isnan(found.residuals[0][:, 1]).all() and np.isnan(found.residuals[0][42]).all()
 
 
-@pytest.mark.parametrize("start", [[0.5, 1.0], slow([2.5, 0.0])], ids=["from above", "from below"])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [[0.5, 1.0], [2.5, 0.0]], ids=["from above", "from below"])
 def test_a_gyroscope_alone(start):
     states = motion(rod, ROD, start, np.zeros(100))
     data = noisy(states, 0.05, 4)

@@ -29,7 +29,8 @@ from lag_envs.stepping.general import stepper_of
 from lag_envs.tasks.pivoted_bar import SwingUp
 
 CASES = {
-    "cart_pole": (CartPole(friction=0.2), [0.3, -1.0, 2.0, 3.0], [4.0], 0.02),
+    "cart_pole": (CartPole(), [0.3, -1.0, 2.0, 3.0], [4.0], 0.02),
+    "friction": (CartPole(friction=0.2), [0.3, -1.0, 2.0, 3.0], [4.0], 0.02),
     "acrobot": (Acrobot(), [0.5, 1.0, -1.0, 2.0], [0.3], 0.02),
     "double": (Chain(bars=2, damping=0.01), [0.1, 0.2, 2.0, -5.0, 1.0, 6.0], [3.0], 0.02),
     "triple, long step": (Chain(bars=3), [0.1, 0.2, 2.0, -5.0, 1.0, 6.0, 0.3, -4.0], [3.0], 0.1),

@@ -80,7 +80,7 @@ def test_each_episode_waits_for_its_own_plan():
     assert (together[:, :1] == alone).all()
 
 
-@pytest.mark.parametrize(("env_id", "name"), every(4, HURRIED))
+@pytest.mark.parametrize(("env_id", "name"), every(6, HURRIED))
 def test_records_tell_how_to_plan_in_real_time(env_id, name):
     task = make_task(env_id)
     agent = build(task, name, real_time=True, background=False)
