@@ -43,6 +43,7 @@ from lag_envs.tasks.registration import make_task
 EPISODES = 20
 EPILOG = """files in the output folder:
   model.zip            the policy; agents.learners.load_policy takes the folder
+  vecnormalize.pkl     statistics of the observations, if Stable-Baselines3 normalises them
   learning_curve.png   returns during training, with those of the controllers and the random policy
   episode.mp4          one fresh episode of the trained policy
   comparison.json      returns and scores of all agents on the same fresh episodes

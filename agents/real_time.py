@@ -1,9 +1,9 @@
 """Planning in real time: how long calls of a controller take, compared with the interval between them.
 
-``python -m agents.real_time`` plays episodes by the clock with every controller that plans. If planning takes
-longer than a step, the controller plans ahead in a separate process, see `Controller.real_time`. The cost is
-the difference between the returns with and without planning ahead, in other episodes that are the same for
-both. `docs/agents.md` shows times and costs.
+``python -m agents.real_time`` plays episodes by the clock with every controller that plans during an episode.
+If planning takes longer than a step, the controller plans ahead in a separate process, as the task's record
+says (`lag_envs.tasks.record.Controller.real_time`). The cost is the difference between the returns with and
+without planning ahead, in other episodes that are the same for both. `docs/agents.md` shows times and costs.
 """
 
 from __future__ import annotations

@@ -52,6 +52,7 @@ EPILOG = f"""files in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
   model.zip            the policy; agents.learners.load_policy takes the folder, and the file is for `load` of
                        Stable-Baselines3, if it is one of its learners
+  vecnormalize.pkl     statistics of the observations, if Stable-Baselines3 normalises them
   tensorboard/         for `tensorboard --logdir FOLDER`; only for Stable-Baselines3's learners
   {CHECKPOINT}       while the run is not finished: everything needed to resume; written {TESTS} times per run
 

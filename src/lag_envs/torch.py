@@ -351,23 +351,24 @@ class TorchVectorEnv:
         ----------
         actions : Tensor, shape (num_envs, n_actions)
             Actions, float32 or float64; finite values outside their space are clipped, and their gradient is
-            then 0.
+            then 0. On a GPU, listed actions are whole numbers.
 
         Returns
         -------
         observations : Tensor of float32, shape (num_envs, n_observations)
             The observations.
-        rewards : Tensor of float64, shape (num_envs,)
-            The rewards.
+        rewards : Tensor, shape (num_envs,)
+            The rewards; float64, on a GPU the `dtype` of the environments.
         terminations, truncations : Tensor of bool, shape (num_envs,)
             Whether episodes end.
         infos : dict
-            The infos that Gymnasium defines, as NumPy arrays.
+            The infos that Gymnasium defines, as NumPy arrays; on a GPU as tensors, with ``refused``.
 
         Raises
         ------
         ValueError, TypeError
             For actions that have another shape, type or device, or are not finite; then nothing is stepped.
+            On a GPU, an action that is not finite ends its episode instead.
         ResetNeeded, StepRefused
             As `LagrangianVectorEnv.step` does.
         """

@@ -39,7 +39,9 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
         help="parallel jobs (default: one per core); timings always run alone",
     )  # fmt: skip
     declare_date(parser, "on the page")
-    parser.add_argument("--docs", metavar="PROJECT", help="afterwards, write docs/accuracy in this checkout")
+    parser.add_argument(
+        "--docs", metavar="PROJECT", help="afterwards, write the accuracy pages of this checkout's docs"
+    )
 
 
 def run_report(args: argparse.Namespace) -> int:
@@ -107,7 +109,8 @@ REPORT = Command(
     """Measure the error of every environment and scene against high precision, beside common integrators
 and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
 Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept, so
-run it again to resume after Ctrl-C. heyoka, diffrax, torchdiffeq and MuJoCo take part if they are installed.
+run it again to resume after Ctrl-C. heyoka, diffrax, torchdiffeq, MuJoCo and Pinocchio take part if
+they are installed.
 
 examples:
   lag-envs report --quick                            a first look, in under a minute

@@ -45,7 +45,7 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE",
         help="the agent's name, as listed by `lag-envs info ID` or on the board; a submission's folder; or a"
         " model of Stable-Baselines3 (a zip, or the folder of its training), whose code is run (default: the"
-        " policy that comes with the package, or zero)",
+        " policy that comes with the package; in other environments a controller of the task, or else zero)",
     )
     parser.add_argument(
         "--episodes",
@@ -153,8 +153,9 @@ WATCH = Command(
     "watch",
     "watch an agent, in a window or as a video",
     """Watch an agent drive an environment, in a window, or write a video. By default, the agent is the
-policy that comes with the package, the best network or table of the leaderboard; controllers are chosen
-by name. This needs the extras render and leaderboard; models of your own also need agents.
+policy that comes with the package: the best network or table of the leaderboard, or a smaller one where
+the best is large. Controllers are chosen by name. This needs the extras render and leaderboard; models
+of your own also need agents.
 
 examples:
   lag-envs watch PivotedBar-v0

@@ -1,4 +1,4 @@
-"""The policies that come with the package: the board's best network or table for each environment.
+"""The policies that come with the package: the board's best networks and tables that are small enough.
 
 ``python -m lag_envs.leaderboard.shipped`` chooses them from a clone's board and writes them beside this file.
 Together they have at most `MOST` bytes; if the best ones are larger, some are replaced by smaller ones,

@@ -44,8 +44,8 @@ OF_BATCHES = ("num_envs", "max_episode_steps", "autoreset_mode", "num_threads", 
 class Task:
     """A task on a scene.
 
-    A subclass defines some of the attributes and methods below, at least `scene`, `interval`, `steps`,
-    `action`, `observe` and `reward`. Formulas access values by name: ``before`` and ``after`` are the states
+    A subclass defines some of the attributes and methods below, at least `scene`, `action`, `observe` and
+    `reward`. Formulas access values by name: ``before`` and ``after`` are the states
     at the start and end of the step, with the names of ``scene.state_names``; ``control`` has the applied
     controls, and ``target`` has the targets. Formulas may use ``+ - * /``, integer powers, comparisons joined
     by ``|`` and ``&``, functions of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum,
@@ -63,9 +63,9 @@ class Task:
     defaults : mapping
         Parameters of the scene whose defaults this task changes.
     interval : float
-        Control interval [s].
+        Control interval [s], 0.02 by default.
     steps : int
-        Steps of an episode.
+        Steps of an episode, 500 by default.
     action : mapping
         For each control that actions set: its limit, a pair (low, high), or a list, array or range of values
         to choose from.
