@@ -3,10 +3,7 @@
 import base64
 import io
 import math
-import os
 import re
-import shutil
-import warnings
 from pathlib import Path
 from typing import get_args
 
@@ -126,31 +123,23 @@ def test_colours_and_widths_are_those_of_the_page():
 
 
 @pytest.fixture(scope="module")
-def page():
+def page(browser):
     """The page's painter in a browser, on an empty page."""
     site = Path(painting.__file__).parents[1] / "leaderboard" / "site" / "static"
-    chromium = shutil.which(os.environ.get("CHROMIUM", "chromium"))
-    if chromium is None:
-        missing = "THERE IS NO CHROMIUM, SO PICTURES WERE NOT HELD AGAINST THE PAGE'S: install chromium"
-        warnings.warn(missing, stacklevel=1)
-        pytest.skip(missing)
-    playwright = pytest.importorskip("playwright.sync_api")
     script, count = re.subn(
         r"\n  // --- replays -",
         "\n  window.painter = { paint, placed, windowOf, readColours };\n  // --- replays -",
         (site / "site.js").read_text(encoding="utf-8"),
     )
     assert count == 1
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=chromium)
-        page = browser.new_page(viewport={"width": 700, "height": 500})
-        page.set_content(
-            f"<style>{(site / 'site.css').read_text(encoding='utf-8')}</style>"
-            "<canvas width=600 height=400></canvas>"
-        )
-        page.evaluate("text => { try { (0, eval)(text); } catch { /* there is no board */ } }", script)
-        yield page
-        browser.close()
+    page = browser.new_page(viewport={"width": 700, "height": 500})
+    page.set_content(
+        f"<style>{(site / 'site.css').read_text(encoding='utf-8')}</style>"
+        "<canvas width=600 height=400></canvas>"
+    )
+    page.evaluate("text => { try { (0, eval)(text); } catch { /* there is no board */ } }", script)
+    yield page
+    page.close()
 
 
 PAINT = """([picture, poses, margin]) => {
