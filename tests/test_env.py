@@ -745,19 +745,33 @@ def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
     assert len(recorded) == 5 + len(others)
 
 
+class Own(Brake):
+    """A task with an attribute that is set before it is made."""
+
+    id = ""
+
+    def __init__(self, gentle=Brake.gentle, **keywords):
+        self.gentle = gentle
+        super().__init__(**keywords)
+
+
 def test_attributes_set_by_hand_are_not_taken_from_elsewhere(monkeypatch):
     # A formula may name an attribute of the task; a program that another task has recorded does not know it.
     def crossing(task):
         return Model(task)([[-0.001, 2.0]], [-1.0])[1][0]
 
-    def task():
-        return make(incline.Brake.id).task
-
-    usual, lenient = crossing(task()), task()
-    lenient.gentle = 1.5
-    assert crossing(lenient) == pytest.approx(usual + 5.0, abs=1e-9)
-    assert crossing(task()) == usual
+    usual, lenient = crossing(Own()), crossing(Own(1.5))
+    assert lenient == pytest.approx(usual + 5.0, abs=1e-9)
+    assert crossing(Own()) == crossing(make(incline.Brake.id).task) == usual
     monkeypatch.setattr(Brake, "gentle", 1.5)
-    assert crossing(task()) == crossing(lenient)
+    assert crossing(make(incline.Brake.id).task) == lenient
     monkeypatch.undo()
-    assert crossing(task()) == usual
+    assert crossing(make(incline.Brake.id).task) == usual
+
+
+@pytest.mark.parametrize("name", ["gentle", "dt", "interval", "scene", "anything"])
+def test_a_task_cannot_be_changed(name):
+    """Its formulas are recorded once, so a change would have no effect."""
+    task = make(incline.Brake.id).task
+    with pytest.raises(AttributeError, match=rf"Brake.{name} cannot be set .* give a keyword"):
+        setattr(task, name, 1.5)

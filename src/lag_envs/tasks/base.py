@@ -247,6 +247,15 @@ class Task:
             self.fixed_target = np.atleast_1d(self.check_target(target))
         self.imperfections = imperfections_of(self, asked)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        # The formulas are recorded once, so a later change would have no effect.
+        if "imperfections" in vars(self):
+            raise dataclasses.FrozenInstanceError(
+                f"{type(self).__name__}.{name} cannot be set once the task is made: give a keyword, write a "
+                "subclass, or set it before super().__init__()"
+            )
+        super().__setattr__(name, value)
+
     # --- what a task defines -------------------------------------------------------------------------------
 
     def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:

@@ -245,13 +245,13 @@ class TaskFormulas:
         task = copy.copy(self._task)
         for name in ("formulas", "drawn"):
             vars(task).pop(name, None)
-        task.scene = self._scene_with_numbers(k)
+        scene = self._scene_with_numbers(k)
         for name in ARGUMENTS:
-            vars(task.scene)[name] = _taking_states(task.scene, name)
-        task.dt = k.dt
-        task._recording = RecordedStep(
+            vars(scene)[name] = _taking_states(scene, name)
+        recording = RecordedStep(
             k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
         )
+        vars(task).update(scene=scene, dt=k.dt, _recording=recording)
         return task
 
     def own(self) -> Task:
