@@ -1,6 +1,7 @@
 """Scenes and tasks outside the package: written by name, with everything that the package's own have."""
 
 import copy
+import dataclasses
 import inspect
 import math
 import pickle
@@ -502,6 +503,24 @@ def _guarded(function, x):
             "reward: a formula calls something .* self.scene.kinetic and self.scene.potential",
         ),
         ({"imperfections": {"lag": -1.0}}, "^Mistaken.imperfections: lag must be 0 or at least .* got -1 s"),
+        ({"observe": lambda self, after, *_: np.ones(2)}, "numbers by name, .* got a ndarray"),
+        ({"observe": lambda self, after, *_: {0: after.x}}, "observe: names must be texts, got 0"),
+        ({"target": {1: ("m", 0.1)}}, r"target\[1\]: a target's name must be a text"),
+        ({"kick": lambda self, after, draws, xp: {"x": "1"}}, "kick returns '1'; it must return numbers"),
+        ({"kick": lambda self, after, draws, xp: {"x": math.inf}}, r"kick\['x'\] must be finite, got inf"),
+        ({"reward": lambda self, *_: 1j}, "reward returns 1j; it must return a number"),
+        ({"reward": lambda self, *_: self.chance(-0.1)}, "chance takes a number from 0 to 1, got -0.1"),
+        ({"reward": lambda self, *_: self.chance(self.scene.load_mass)}, "chance takes a number from 0 to 1"),
+        ({"limit": 2.4}, "Mistaken.limit hides an attribute of every task; choose another name"),
+        ({"fixed_target": 2.4}, "Mistaken.fixed_target hides an attribute of every task"),
+        ({"goal": 1.0}, "Mistaken.goal must be a record.Goal, got 1.0; choose another name for a number"),
+        ({"reference": 1.0}, "Mistaken.reference must be text, got 1.0"),
+        ({"dt": 0.5}, r"Mistaken.dt is a keyword of environments; in a class, write interval \[s\]"),
+        ({"duration": 0.5}, "Mistaken.duration is a keyword of environments; in a class, write steps"),
+        ({"bounds": {"x": 1.0}}, r"Mistaken.bounds must be bounds\(self\), got {'x': 1.0}"),
+        ({"check": 1}, r"Mistaken.check must be check\(self\), got 1"),
+        ({"defaults": ["m"]}, r"Mistaken.defaults must map names to values, as a dict does, got \['m'\]"),
+        ({"imperfections": None}, "Mistaken.imperfections must map names to values, .* got None"),
         (
             {"target": {}, "observe": lambda self, after, target, xp: {"x": target.x_goal}},
             "no target 'x_goal', nor any other",
@@ -697,6 +716,8 @@ def test_a_kick_states_how_many_numbers_it_draws():
 def test_misspelt_names_are_noticed():
     with pytest.warns(UserWarning, match=r"nothing uses Mistaken.terminate; did you mean terminated?"):
         _mistaken(terminate=lambda self, after, target, xp: after.x > 1.0)()
+    with pytest.warns(UserWarning, match=r"nothing uses Mistaken.slew; write imperfections = {'slew': ...}"):
+        _mistaken(slew=3.0)()
     with pytest.warns(UserWarning, match=r"nothing uses Sticky.disipation; did you mean dissipation?"):
         type("Sticky", (own_tasks.Crane,), {"disipation": lambda self, q, v, u, xp: v.x**2})()
     # A name that a formula uses is the user's own business.
@@ -710,6 +731,87 @@ def test_what_cannot_be_registered_is_named():
         lag_envs.register(own_tasks.Crane)
     with pytest.raises(ValueError, match='Blank has no id; write id = "Blank-v0" into the class'):
         lag_envs.register(type("Blank", (own_tasks.Deliver,), {"id": ""}))
+    with pytest.raises(ValueError, match="register takes a task's class, or 'module:Class', got <"):
+        lag_envs.register(own_tasks.Deliver())
+
+
+def test_a_task_is_no_dataclass():
+    """The decorator would replace how tasks are made."""
+    decorated = dataclasses.dataclass(type("Decorated", (own_tasks.Deliver,), {}))
+    with pytest.raises(FormulaError, match="Decorated must not be a dataclass: tasks are written without"):
+        decorated()
+
+
+def test_a_keyword_of_ones_own_stays_where_parameters_are_drawn():
+    class Bonus(own_tasks.Deliver):
+        id = ""
+
+        def __init__(self, bonus, **keywords):
+            self.bonus = bonus
+            super().__init__(**keywords)
+
+        def reward(self, before, after, control, target, dt, xp):
+            return self.bonus
+
+    envs = [
+        LagrangianEnv(Bonus, bonus=7.0, **drawn) for drawn in ({}, {"randomize": {"load_mass": (0.5, 2.0)}})
+    ]
+    for env in envs:
+        env.reset(seed=0)
+        assert env.step(env.action_space.sample())[1] == 7.0
+        assert env.drawn_task.bonus == 7.0
+    assert Bonus(3.0, load_mass=0.5).varied(load_mass=0.4).scene.load_mass == 0.4
+
+
+@pytest.mark.parametrize(
+    "potential",
+    [
+        lambda self, q, xp: (q.x - self.length) ** 2,
+        lambda self, q, xp: xp.cos(q.x - self.length) + (q.x - q.y - self.length) ** 4,
+        lambda self, q, xp: (xp.sqrt(1.0 + q.x**2 + q.y**2) - self.length) ** 2,
+    ],
+)
+def test_a_length_that_is_zero_in_part_of_a_batch(potential):
+    """Nothing divides by it, so it is a number like others."""
+
+    class Beads(Scene):
+        length: float = parameter(0.1, "m")
+        coordinates = {"x": "m", "y": "m"}
+        controls = {"force": "N"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * (1.0 + (q.y + self.length) ** 2) * v.x**2 + v.y**2
+
+        def dissipation(self, q, v, u, xp):
+            return 0.1 * (1.0 + (q.x - self.length) ** 2) * v.x**2
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.force}
+
+    Beads.potential = potential
+
+    class Shift(Task):
+        id = "OwnShift-v0"
+        scene = Beads
+        action = {"force": 1.0}
+        start = {"x": 0.3, "y": 0.2}
+
+        def observe(self, after, target, xp):
+            return {"x": after.x}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return after.x
+
+    envs = LagrangianVectorEnv(Shift, 2, length=np.array([0.0, 0.1]))
+    singles = [LagrangianEnv(Shift, length=length) for length in (0.0, 0.1)]
+    envs.reset(seed=3)
+    for i, env in enumerate(singles):
+        env.reset(seed=3 + i)
+    for _ in range(5):
+        envs.step(np.ones((2, 1), np.float32))
+        for i, env in enumerate(singles):
+            env.step(np.ones(1, np.float32))
+            assert envs.state[i] == pytest.approx(env.state, rel=1e-13, abs=1e-14)
 
 
 def test_comparisons_count_as_one_and_zero():

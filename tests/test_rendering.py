@@ -137,6 +137,19 @@ def test_a_task_adds_shapes_where_frames_are():
 
     with pytest.raises(FormulaError, match=r"Wide\.window has 'hat'"):
         Wide().shapes(Frame([0.0] * 4))
+    for methods, message in (
+        ({"window": lambda self: (0.0, 1.0)}, r"window must return Window\(left, .*, got \(0.0, 1.0\)"),
+        (
+            {"bodies": lambda self: {"bar": [Circle((0.0, 0.0), math.nan)]}},
+            "numbers must be finite, got Circle",
+        ),
+        (
+            {"indicators": lambda self, now, xp: {"hat": (now.target, 0.0)}},
+            "'hat': take numbers by their names",
+        ),
+    ):
+        with pytest.raises(FormulaError, match=message):
+            type("Wrong", (pivoted_bar.SwingUp,), methods)().shapes(Frame([0.0] * 4))
 
     class Old(pivoted_bar.SwingUp):
         def shapes(self, now):

@@ -8,9 +8,9 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from types import CodeType
+from types import CodeType, MappingProxyType
 from typing import Any
 
 
@@ -140,11 +140,18 @@ def _without_version(name: str) -> str:
     return re.sub(r"-v\d+$", "", name.lower())
 
 
-def warn_of_misspelt(kind: type, base: type) -> None:
+def warn_of_misspelt(kind: type, base: type, instead: Mapping[str, str] = MappingProxyType({})) -> None:
     """Warn of names in a class that resemble names of its base and that no method of the class uses.
 
     Such a name would be ignored without a word: with ``disipation`` there would be no dissipation. Base
     classes from this package are not searched.
+
+    Parameters
+    ----------
+    kind, base : type
+        The class, and the class that it is derived from.
+    instead : mapping, optional
+        Further names that are ignored, with what to write in their place.
     """
     classes = kind.__mro__[: kind.__mro__.index(base)]
     theirs = [c for c in classes if not c.__module__.startswith("lag_envs.")]
@@ -156,9 +163,10 @@ def warn_of_misspelt(kind: type, base: type) -> None:
         for name in vars(c):
             if name.startswith("_") or name in known or name in used:
                 continue
-            for meant in difflib.get_close_matches(name, known, n=1, cutoff=0.8):
-                message = f"nothing uses {c.__name__}.{name}; did you mean {meant}?"
-                warnings.warn(message, UserWarning, stacklevel=2)
+            close = difflib.get_close_matches(name, known, n=1, cutoff=0.8)
+            if name in instead or close:
+                meant = f"write {instead[name]}" if name in instead else f"did you mean {close[0]}?"
+                warnings.warn(f"nothing uses {c.__name__}.{name}; {meant}", UserWarning, stacklevel=2)
 
 
 def _names_in(value: Any) -> Iterator[str]:

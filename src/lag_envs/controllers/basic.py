@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import SimpleNamespace
@@ -228,13 +227,6 @@ class FeedbackController(ABC):
     ) -> tuple[NDArray, Any]:
         """Return the action for each observation."""
         return actions_for(self.task, self.control(*self.read(observation))), state
-
-
-def remade(task: Task, kind: type[Task] | None = None, /, **changes: Any) -> Task:
-    """Return a task with the same parameters except for the changes, by default of the same class."""
-    fields = dataclasses.fields(task.scene)
-    own = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
-    return (kind or type(task))(**({"dt": task.dt, "duration": task.duration} | own | changes))
 
 
 def actions_for(task: Task, controls: Array) -> NDArray:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, remade
+from lag_envs.controllers.basic import Array
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import BalanceLQR
 from lag_envs.controllers.mpc import MPC, held, loss, without_kicks
@@ -61,7 +61,7 @@ def easier(
         away = 2.0 * (1.0 + np.cos(angles)).sum(axis=1) + 0.01 * (rates**2).sum(axis=1)
         return 10.0 * (away + 0.3 * (s / task.length) ** 2 + 0.1 * s_dot**2)
 
-    return remade(task, Easier), end
+    return task.varied(Easier), end
 
 
 def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:

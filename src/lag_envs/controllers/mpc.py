@@ -16,7 +16,6 @@ from lag_envs.controllers.basic import (
     beginning,
     check_continuous,
     check_counts,
-    remade,
 )
 from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
 from lag_envs.controllers.linear import regulator, time_varying
@@ -434,7 +433,7 @@ def renewed(
     laws = [recorded(task, kind) for kind in (["followed", "quick"] if plans.quick else ["followed"])]
     first = [*laws, *(law.mirrored() for law in laws)]
     if finer > 1:
-        task = remade(task, dt=finer * task.dt)
+        task = task.varied(dt=finer * task.dt)
     horizon = round(beyond * max(len(law.actions) for law in laws) * task.interval / task.dt)
     return held(
         task, plans=plans, first=first, horizon=horizon, iterations=iterations, finer=finer, **numbers

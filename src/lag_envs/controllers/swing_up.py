@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array, check_names, check_single_control, remade
+from lag_envs.controllers.basic import Array, check_names, check_single_control
 from lag_envs.tasks.base import Task
 
 
@@ -69,7 +69,7 @@ def easier(
             return -cost
 
     rest = dict(zip(task.scene.state_names, task.plans.rest, strict=True))
-    return remade(task, Easier, dt=every * task.dt), away(task, end, rest)
+    return task.varied(Easier, dt=every * task.dt), away(task, end, rest)
 
 
 def away(task: Task, weights: Mapping[str, float], rest: Mapping[str, float]) -> Callable[[Array], Array]:

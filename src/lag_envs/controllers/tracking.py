@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import FeedbackLaw, check_continuous, remade
+from lag_envs.controllers.basic import FeedbackLaw, check_continuous
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -170,7 +170,7 @@ def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> T
 
 def smoothed(task: Task) -> Task:
     """Return the model from which the feedback along a task's plans comes, see `Plans.smooth`."""
-    return remade(task, **task.plans.smooth) if task.plans.smooth else task
+    return task.varied(**task.plans.smooth) if task.plans.smooth else task
 
 
 def waves(rng: np.random.Generator, n: int, steps: int, dt: float, count: int) -> Array:

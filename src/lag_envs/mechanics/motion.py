@@ -220,12 +220,16 @@ def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Colle
 
 
 def _is_hard(expr: Expr, name: str) -> bool:
-    """Return whether a parameter occurs in a denominator or in a function."""
-    return any(
-        n < 0 and atom.name == name if atom.argument is None else parameter(name) in atom.argument.symbols()
-        for monomial in expr.terms
-        for atom, n in monomial
-    )
+    """Return whether formulas may differ where a parameter is 0: in a denominator, a root or a logarithm."""
+
+    def hard(atom: Atom, power: int) -> bool:
+        if atom.argument is None:
+            return power < 0 and atom.name == name
+        if power < 0 or atom.function in ("sqrt", "log"):
+            return parameter(name) in atom.argument.symbols()
+        return _is_hard(atom.argument, name)
+
+    return any(hard(atom, n) for monomial in expr.terms for atom, n in monomial)
 
 
 def _check_left_out(of: str, layout: SceneLayout, mass: Mapping, force: list[Expr]) -> None:

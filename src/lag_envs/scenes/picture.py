@@ -82,6 +82,9 @@ class Picture:
     def __init__(self, of: Any) -> None:
         self._of, self._scene = of, getattr(of, "scene", of)
         bodies, window = of.bodies(), of.window()
+        if not isinstance(window, Window):
+            wanted = "Window(left, bottom, right, top)"
+            raise FormulaError(f"{type(of).__name__}.window must return {wanted}, got {window!r:.60}")
         found = self._poses(Frame([0.0] * len(self._scene.state_names)))
         self.frames = list(found)
         for frame in [*bodies, *filter(None, [window.frame])]:
@@ -183,6 +186,8 @@ def check_shapes(of: Any, frame: str, shapes: Any) -> None:
                 f"{type(of).__name__}.bodies must have a list of shapes ({kinds}) for {frame!r}, "
                 f"got {shapes!r:.60}"
             )
+        if not math.isfinite(extent([shape])):
+            raise FormulaError(f"{type(of).__name__}.bodies: numbers must be finite, got {shape!r:.80}")
 
 
 def indicated(of: Any, now: Now, xp: Any = Seen) -> dict[str, tuple]:
@@ -196,6 +201,8 @@ def indicated(of: Any, now: Now, xp: Any = Seen) -> dict[str, tuple]:
                 raise FormulaError(
                     f"{frame!r} must be at (x, y), (x, y, angle) or (x, y, angle, part), got {pose!r:.60}"
                 )
+            if any(isinstance(number, Values) for number in pose):
+                raise FormulaError(f"{frame!r}: take numbers by their names, as in now.target.NAME")
     return dict(found)
 
 

@@ -6,10 +6,11 @@ import contextlib
 import dataclasses
 import inspect
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from types import MappingProxyType, SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import numpy as np
@@ -25,6 +26,7 @@ from lag_envs.scenes.declaring import ORDER, complete
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, structure_of
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
 from lag_envs.stepping.series import check_order
+from lag_envs.tasks.definition import check_definition
 from lag_envs.tasks.formulas import UNBOUNDED, TaskFormulas, control_of
 from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
@@ -41,7 +43,22 @@ OF_ENVIRONMENTS = ("render_mode", "diagnostics", "show_arrows", "show_trail", "s
 OF_BATCHES = ("num_envs", "max_episode_steps", "autoreset_mode", "num_threads", "show_tiles")
 
 
-class Task:
+class _Made:
+    """Remembers the arguments of a task, among which may be those of a subclass.
+
+    It is a class of its own so that the signature of `Task` is that of its ``__init__``.
+    """
+
+    _made_with: tuple[tuple, dict[str, Any]]
+
+    def __new__(cls, *given: Any, **keywords: Any) -> Self:
+        check_definition(cls, Task)
+        task = super().__new__(cls)
+        vars(task)["_made_with"] = given, keywords
+        return task
+
+
+class Task(_Made):
     """A task on a scene.
 
     A subclass defines some of the attributes and methods below, at least `scene`, `action`, `observe` and
@@ -177,13 +194,6 @@ class Task:
         self, *, dt: float | None = None, duration: float | None = None, target: Any = None, **parameters: Any
     ) -> None:
         of = type(self).__name__
-        if hasattr(type(self), "scene_type"):
-            raise FormulaError(
-                f"{of} is written for lag_envs 0.1, with scene_type and formulas by index; "
-                "write scene, action, start, observe and reward by name (see CHANGELOG.md)"
-            )
-        if type(self).shapes is not Task.shapes:
-            raise FormulaError(f"{of}.shapes: {picture.INSTEAD_OF_SHAPES}")
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
             raise FormulaError(f"{of}.scene must be a class derived from Scene, got {kind!r:.60}")
@@ -413,9 +423,11 @@ class Task:
 
     def chance(self, per_interval: float) -> float:
         """Return an event's chance per step from that per interval; any `dt` gives the same rate."""
+        if not isinstance(per_interval, numbers.Real) or not 0.0 <= per_interval <= 1.0:
+            raise FormulaError(f"chance takes a number from 0 to 1, got {per_interval!r:.60}")
         if self._recording is not None:
             return self._recording.chance(per_interval)
-        if self.dt == self.interval:
+        if self.dt == self.interval or per_interval == 1.0:
             return per_interval
         return -math.expm1(self.dt / self.interval * math.log1p(-per_interval))
 
@@ -435,14 +447,11 @@ class Task:
         """The tasks from which each episode's task is drawn, or None if no parameter is drawn."""
         return Drawn(self) if self.imperfections and self.imperfections.drawn else None
 
-    def varied(self, **parameters: float) -> Task:
-        """Return the same task, without imperfections, with other parameters of the scene."""
-        target: Any = self.fixed_target
-        if target is not None:
-            target = float(target[0]) if len(target) == 1 else target
-        off = dict.fromkeys(KEYWORDS)
-        given = self.given | parameters
-        return type(self)(dt=self.dt, duration=self.duration, target=target, **given, **off)
+    def varied(self, kind: type[Task] | None = None, /, **changes: Any) -> Task:
+        """Return the same task, without imperfections, with other keywords; or one of another class."""
+        given, keywords = self._made_with
+        off = {name: None for name in KEYWORDS if name in keywords or name in type(self).imperfections}
+        return (kind or type(self))(*given, **(keywords | off | changes))
 
     @property
     def observation(self) -> tuple[str, ...]:
@@ -543,8 +552,8 @@ class Task:
         columns = np.reshape(np.asarray(actions, np.float64), (-1, len(self.formulas.acting))).T
         columns = np.asarray(self.formulas.shares([*columns]))
         names, found = self.scene.control_names, np.zeros((columns.shape[-1], len(self.scene.control_names)))
-        for acting, numbers in zip(self.formulas.acting, columns, strict=True):
-            found[:, names.index(acting.control)] = control_of(acting, numbers, np)
+        for acting, column in zip(self.formulas.acting, columns, strict=True):
+            found[:, names.index(acting.control)] = control_of(acting, column, np)
         return found
 
     def share(self, control: Any) -> list[Any]:

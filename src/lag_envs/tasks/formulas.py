@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics.algebra import INSTEAD, FormulaError
 from lag_envs.mechanics.recording import ARGUMENTS, Values, displaced, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
@@ -75,14 +74,14 @@ class State(Values):
     A coordinate named ``q`` or ``v`` hides them.
     """
 
-    __slots__ = ("places",)
+    __slots__ = ("_places",)
 
     def __init__(self, entries: Mapping[str, Any], places: Values, velocities: Values) -> None:
         hidden = {"q": places, "v": velocities}
         super().__init__(
             "entry of the state", entries, {name: hidden[name] for name in hidden if name not in entries}
         )
-        object.__setattr__(self, "places", places)
+        object.__setattr__(self, "_places", places)
 
 
 class Lifted:
@@ -121,7 +120,9 @@ class Lifted:
 _checked: weakref.WeakKeyDictionary[type, dict[tuple, tuple]] = weakref.WeakKeyDictionary()
 
 #: Attributes of a task whose numbers reach its code as constants, if at all.
-_NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imperfections", "drawn"}
+_NUMBERS = frozenset(
+    ("scene", "dt", "duration", "fixed_target", "formulas", "given", "imperfections", "drawn", "_made_with")
+)
 
 
 class TaskFormulas:
@@ -174,13 +175,14 @@ class TaskFormulas:
         known = _checked.setdefault(type(task), {})
         key = self.key
         if key not in known:
-            _check_definition(task, base)
             names, code = self._recorded()
-            if self._recorded()[1] != code:
+            if self._recorded() != (names, code):
                 raise FormulaError(
                     f"{self._of}: a formula gives another result when it is run again; formulas may "
                     "depend on their arguments and on parameters only, not on time or chance"
                 )
+            self.observation = names
+            self.box()  # for its errors
             known[key] = names, self._chances
         self.observation, self._chances = known[key]
 
@@ -386,9 +388,7 @@ class TaskFormulas:
         xp = self._known(xp, y, z)
         before, after = self.named_state(y, k), self.named_state(z, k)
         value = self._call(name, k, before, after, self._applied(u), self.named_targets(g), k.dt, xp)
-        array = isinstance(value, np.ndarray) and isinstance(k.scale, TracedNumber)
-        if value is None or array or isinstance(value, Mapping | Sequence | Values):
-            self._refuse(name, value, "a number")
+        self._check_numbers(name, {"": value}, k, "a number")
         return k.scale * value if self._task.scaled else _counted(value)
 
     def added(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> dict[str, Any]:
@@ -398,9 +398,7 @@ class TaskFormulas:
         if not isinstance(added, Mapping):
             self._refuse("kick", added, "changes of the state's entries by name")
         self._check_names("kick", "entry {!r} of the state", added, self.state)
-        for value in added.values():
-            if isinstance(value, Values):
-                self._refuse("kick", value, "numbers")
+        self._check_numbers("kick", added, k, "numbers")
         return dict(added)
 
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
@@ -418,9 +416,13 @@ class TaskFormulas:
         """Return the observation."""
         found = self._call("observe", k, self.named_state(y, k), self.named_targets(g), self._known(xp, y))
         if not isinstance(found, Mapping) or not found:
-            got = "nothing" if not found else f"a {type(found).__name__}"
+            empty = found is None or isinstance(found, Mapping)
+            got = "nothing" if empty else f"a {type(found).__name__}"
             wanted = 'numbers by name, as in {"x": after.x}'
             raise FormulaError(f"{self._of}.observe must return {wanted}, got {got}")
+        for name in found:
+            if not isinstance(name, str):
+                raise FormulaError(f"{self._of}.observe: names must be texts, got {name!r:.60}")
         return [_counted(value) for value in found.values()]
 
     def _recorded(self) -> tuple[tuple[str, ...], str]:
@@ -449,17 +451,21 @@ class TaskFormulas:
             "kick": self.kick(trace, d, z, k) if self.draws else [],
             "observe": self.observe(trace, y, g, k),
         }
-        for name, values in found.items():
-            for value in values:
-                if not isinstance(value, TracedNumber | numbers.Real | np.bool_):
-                    self._refuse(name, value, "a number" if "reward" in name else "numbers")
         names = tuple(self._call("observe", k, self.named_state(y, k), self.named_targets(g), trace))
         for name, entries in (("guard", self._controls), ("observe", names)):
-            for entry, value in zip(entries, found[name], strict=True):
-                if isinstance(value, numbers.Real):  # the same in every step
-                    _numbers_of(f"{self._of}.{name}[{entry!r}]", [value])
+            self._check_numbers(name, dict(zip(entries, found[name], strict=True)), k, "numbers")
         code = trace.operations([ended, *itertools.chain(*found.values())])
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
+
+    def _check_numbers(self, name: str, found: Mapping[str, Any], k: Any, wanted: str) -> None:
+        """Raise a FormulaError if a recorded formula returns anything but numbers; named ones are finite."""
+        if not isinstance(k.dt, TracedNumber):
+            return  # on other numbers, such as arrays, it is only run after it has been recorded
+        for entry, value in found.items():
+            if not isinstance(value, TracedNumber | numbers.Real | np.bool_):
+                self._refuse(name, value, wanted)
+            if entry and isinstance(value, numbers.Real):
+                _numbers_of(f"{self._of}.{name}[{entry!r}]", [value])
 
     def _refuse(self, name: str, found: Any, wanted: str) -> NoReturn:
         kinds = {TracedNumber: "a number", np.ndarray: "an array", list: "a list", tuple: "a tuple"}
@@ -556,7 +562,7 @@ def _taking_states(scene: Any, name: str) -> Callable:
                 f"self.scene.{name} is given the state in place of the velocities; give after.v or before.v"
             )
         if isinstance(q := bound.arguments.get("q"), State):
-            bound.arguments["q"] = q.places
+            bound.arguments["q"] = q._places
         return method(*bound.args, **bound.kwargs)
 
     return taking
@@ -567,28 +573,10 @@ def _counted(value: Any) -> Any:
     return 1.0 * value if is_truth(value) else value
 
 
-def _check_definition(task: Task, base: type[Task]) -> None:
-    """Raise a FormulaError if a task has a kick that is never used; warn of misspelt names."""
-    kind = type(task)
-    counted = any("draws" in vars(c) for c in kind.__mro__[: kind.__mro__.index(base)])
-    if kind.kick is not base.kick and not counted:
-        raise FormulaError(
-            f"{kind.__name__}.kick is defined, but not how many random numbers it takes: write draws = 1, "
-            "or the number that it takes"
-        )
-    if kind.kick is base.kick and task.draws:
-        raise FormulaError(f"{kind.__name__}.draws is {task.draws}, but there is no kick to use these draws")
-    warn_of_misspelt(kind, base)
-
-
 def _check_arguments(task: Task, base: type[Task]) -> None:
     """Raise a FormulaError if a formula does not take the arguments that it is given."""
     for name in FORMULAS:
         method, wanted = getattr(task, name), list(inspect.signature(getattr(base, name)).parameters)
-        if not callable(method):
-            raise FormulaError(
-                f"{type(task).__name__}.{name} must be {name}({', '.join(wanted)}), got {method!r:.60}"
-            )
         taken = inspect.signature(method)
         try:
             fits = bool(taken.bind(*wanted[1:])) and not displaced([*taken.parameters], wanted[1:])
@@ -654,6 +642,8 @@ def _target_boxes(task: Task) -> list[TargetBox]:
     of, found = type(task).__name__, []
     for name, given in _mapping(task, "target").items():
         where = f"{of}.target[{name!r}]"
+        if not isinstance(name, str) or name.startswith("_"):
+            raise FormulaError(f"{where}: a target's name must be a text that does not begin with _")
         if not isinstance(given, tuple) or len(given) not in (2, 3) or not isinstance(given[0], str):
             raise FormulaError(f"{where} must be (unit, half width), got {given!r:.60}")
         *centre, half = _numbers_of(where, given[1:])

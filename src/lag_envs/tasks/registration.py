@@ -48,6 +48,8 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
         if not id:
             raise ValueError(f'{task.__name__} has no id; write id = "{task.__name__}-v0" into the class')
         task = _place(task)
+    if not isinstance(task, str | type):
+        raise ValueError(f"register takes a task's class, or 'module:Class', got {task!r:.60}")
     if not id:
         raise ValueError(f"an id is needed to register {task!r}")
     gym.register(

@@ -1,0 +1,89 @@
+"""What a task's class may define; its mistakes are named before anything is recorded."""
+
+from __future__ import annotations
+
+import inspect
+import weakref
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.errors import warn_of_misspelt
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.scenes import picture
+from lag_envs.tasks.formulas import FORMULAS
+from lag_envs.tasks.imperfections import KEYWORDS
+from lag_envs.tasks.record import Examples, Goal, Open, Optimum, ValueIteration
+
+#: What a task may define besides its attributes; all other public names of `Task` are its calls.
+METHODS = (
+    *FORMULAS,
+    *("bounds", "reached", "behaviour", "check", "check_start", "check_target", "check_usable", "fastest"),
+    *("edges", "variant", "bodies", "indicators", "window", "readings"),
+)
+#: Attributes that map names to something; `action`, `start` and `target` are read for each task.
+MAPPINGS = ("defaults", "usable", "imperfections", "controllers", "hyperparameters", "quantities")
+#: Attributes that are texts, and those that are parts of a record.
+KINDS: dict[str, type] = dict.fromkeys(("id", "peer", "reference", "difficulty", "note"), str) | {
+    "goal": Goal,
+    "value_iteration": ValueIteration,
+    "optimum": Optimum,
+    "open": Open,
+    "examples": Examples,
+}
+#: What a class has in place of keywords of environments.
+INSTEAD = {"max_episode_steps": "steps"} | {name: f"imperfections = {{{name!r}: ...}}" for name in KEYWORDS}
+
+_checked: weakref.WeakSet[type] = weakref.WeakSet()
+
+
+def check_definition(kind: type, base: type) -> None:
+    """Raise a FormulaError if a task's class is not defined as tasks are; warn of names that nothing uses."""
+    if kind in _checked:
+        return
+    if hasattr(kind, "scene_type"):
+        raise FormulaError(
+            f"{kind.__name__} is written for lag_envs 0.1, with scene_type and formulas by index; "
+            "write scene, action, start, observe and reward by name (see CHANGELOG.md)"
+        )
+    if kind.shapes is not base.shapes:  # type: ignore[attr-defined]
+        raise FormulaError(f"{kind.__name__}.shapes: {picture.INSTEAD_OF_SHAPES}")
+    attributes = inspect.get_annotations(base)
+    for c in kind.__mro__[: kind.__mro__.index(base)]:
+        if "__dataclass_fields__" in vars(c):
+            raise FormulaError(
+                f"{c.__name__} must not be a dataclass: tasks are written without a decorator, and their "
+                "attributes are read from the class"
+            )
+        for name, value in vars(c).items():
+            where = f"{c.__name__}.{name}"
+            if name in ("dt", "duration"):
+                instead = "interval [s]" if name == "dt" else "steps"
+                raise FormulaError(f"{where} is a keyword of environments; in a class, write {instead}")
+            defined = name in METHODS or name in attributes or name.startswith("_")
+            if name in ("given", "fixed_target") or (hasattr(base, name) and not defined):
+                raise FormulaError(f"{where} hides an attribute of every task; choose another name")
+            if inspect.isfunction(vars(base).get(name)) and not callable(getattr(c, name)):
+                arguments = ", ".join(inspect.signature(getattr(base, name)).parameters)
+                raise FormulaError(f"{where} must be {name}({arguments}), got {value!r:.60}")
+            if name in MAPPINGS and not (isinstance(value, Mapping) or hasattr(value, "__get__")):
+                raise FormulaError(f"{where} must map names to values, as a dict does, got {value!r:.60}")
+            wanted = KINDS.get(name)
+            if wanted and not (value is None or isinstance(value, wanted) or hasattr(value, "__get__")):
+                what = "text" if wanted is str else f"a record.{wanted.__name__}"
+                raise FormulaError(
+                    f"{where} must be {what}, got {value!r:.60}; choose another name for a number of your own"
+                )
+    _check_kick(kind, base)
+    warn_of_misspelt(kind, base, INSTEAD)
+    _checked.add(kind)
+
+
+def _check_kick(kind: Any, base: Any) -> None:
+    counted = any("draws" in vars(c) for c in kind.__mro__[: kind.__mro__.index(base)])
+    if kind.kick is not base.kick and not counted:
+        raise FormulaError(
+            f"{kind.__name__}.kick is defined, but not how many random numbers it takes: write draws = 1, "
+            "or the number that it takes"
+        )
+    if kind.kick is base.kick and kind.draws:
+        raise FormulaError(f"{kind.__name__}.draws is {kind.draws}, but there is no kick to use these draws")
