@@ -62,14 +62,14 @@ class Task(_Made):
     """A task on a scene.
 
     A subclass defines some of the attributes and methods below, at least `scene`, `action`, `observe` and
-    `reward`. Formulas access values by name: ``before`` and ``after`` are the states
-    at the start and end of the step, with the names of ``scene.state_names``; ``control`` has the applied
-    controls, and ``target`` has the targets. Formulas may use ``+ - * /``, integer powers, comparisons joined
-    by ``|`` and ``&``, functions of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum,
-    maximum), and the scene's parameters and energies: ``self.scene.mass``,
-    ``self.scene.potential(after, xp)`` and ``self.scene.kinetic(after, after.v, xp)``. ``after.q`` and
-    ``after.v`` are the places and velocities by coordinate, as the energies take them. A coordinate whose
-    velocity jumps with a control has no entry in ``after.v``: the state holds ``w`` instead.
+    `reward`. Formulas access values by name: ``before`` and ``after`` are the states at the start and end of
+    the step, with the names of ``scene.state_names``; ``control`` has the applied controls, and ``target``
+    has the targets. Formulas may use ``+ - * /``, integer powers, comparisons joined by ``|`` and ``&``,
+    functions of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum), and the
+    scene's parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)`` and
+    ``self.scene.kinetic(after, after.v, xp)``. ``after.q`` and ``after.v`` are the places and velocities by
+    coordinate, as the energies take them. A coordinate whose velocity jumps with a control has no entry in
+    ``after.v``: the state holds ``w`` instead.
 
     Attributes
     ----------

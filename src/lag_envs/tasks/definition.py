@@ -47,7 +47,6 @@ def check_definition(kind: type, base: type) -> None:
         )
     if kind.shapes is not base.shapes:  # type: ignore[attr-defined]
         raise FormulaError(f"{kind.__name__}.shapes: {picture.INSTEAD_OF_SHAPES}")
-    attributes = inspect.get_annotations(base)
     for c in kind.__mro__[: kind.__mro__.index(base)]:
         if "__dataclass_fields__" in vars(c):
             raise FormulaError(
@@ -55,27 +54,35 @@ def check_definition(kind: type, base: type) -> None:
                 "attributes are read from the class"
             )
         for name, value in vars(c).items():
-            where = f"{c.__name__}.{name}"
-            if name in ("dt", "duration"):
-                instead = "interval [s]" if name == "dt" else "steps"
-                raise FormulaError(f"{where} is a keyword of environments; in a class, write {instead}")
-            defined = name in METHODS or name in attributes or name.startswith("_")
-            if name in ("given", "fixed_target") or (hasattr(base, name) and not defined):
-                raise FormulaError(f"{where} hides an attribute of every task; choose another name")
-            if inspect.isfunction(vars(base).get(name)) and not callable(getattr(c, name)):
-                arguments = ", ".join(inspect.signature(getattr(base, name)).parameters)
-                raise FormulaError(f"{where} must be {name}({arguments}), got {value!r:.60}")
-            if name in MAPPINGS and not (isinstance(value, Mapping) or hasattr(value, "__get__")):
-                raise FormulaError(f"{where} must map names to values, as a dict does, got {value!r:.60}")
-            wanted = KINDS.get(name)
-            if wanted and not (value is None or isinstance(value, wanted) or hasattr(value, "__get__")):
-                what = "text" if wanted is str else f"a record.{wanted.__name__}"
-                raise FormulaError(
-                    f"{where} must be {what}, got {value!r:.60}; choose another name for a number of your own"
-                )
+            if fault := _fault(base, name, value):
+                raise FormulaError(f"{c.__name__}.{name} {fault}")
     _check_kick(kind, base)
     warn_of_misspelt(kind, base, INSTEAD)
     _checked.add(kind)
+
+
+def _fault(base: type, name: str, value: Any) -> str:
+    """Return what is wrong with a class's attribute, if anything."""
+    if name in ("dt", "duration"):
+        return (
+            f"is a keyword of environments; in a class, write {'interval [s]' if name == 'dt' else 'steps'}"
+        )
+    defined = name in METHODS or name in inspect.get_annotations(base) or name.startswith("_")
+    if name in ("given", "fixed_target") or (hasattr(base, name) and not defined):
+        return "hides an attribute of every task; choose another name"
+    if (value is None and name in KINDS) or hasattr(
+        value, "__get__"
+    ):  # a method, or computed when it is read
+        return ""
+    got = f"got {value!r:.60}"
+    if inspect.isfunction(vars(base).get(name)) and not callable(value):
+        return f"must be {name}({', '.join(inspect.signature(getattr(base, name)).parameters)}), {got}"
+    if name in MAPPINGS and not isinstance(value, Mapping):
+        return f"must map names to values, as a dict does, {got}"
+    if name in KINDS and not isinstance(value, KINDS[name]):
+        what = "text" if KINDS[name] is str else f"a record.{KINDS[name].__name__}"
+        return f"must be {what}, {got}; choose another name for a number of your own"
+    return ""
 
 
 def _check_kick(kind: Any, base: Any) -> None:
