@@ -109,6 +109,8 @@ def test_adapter_attributes():
     assert envs.get_attr("mark", [0, 2]) == [7, 7]
     with pytest.raises(NotImplementedError, match="all of its environments"):
         envs.set_attr("mark", 8, [0])
+    with pytest.raises(AttributeError, match=r"^damping cannot be set once the environment is made"):
+        envs.set_attr("damping", 8.0)
     assert len(envs.env_method("render")) == 3
     assert envs.render().ndim == 3  # tiled into one picture
     envs.close()

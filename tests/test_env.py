@@ -769,6 +769,15 @@ def test_attributes_set_by_hand_are_not_taken_from_elsewhere(monkeypatch):
     assert crossing(make(incline.Brake.id).task) == usual
 
 
+@pytest.mark.parametrize("name", ["damping", "dt", "scene", "task", "action_noise"])
+def test_what_is_decided_when_an_environment_is_made_cannot_be_set(name):
+    env = make(incline.Brake.id)
+    with pytest.raises(AttributeError, match=rf"^{name} cannot be set .* make another one with other keyw"):
+        setattr(env, name, 1.5)
+    env.note = "one's own"
+    assert copy.deepcopy(env).note == "one's own"
+
+
 @pytest.mark.parametrize("name", ["gentle", "dt", "interval", "scene", "anything"])
 def test_a_task_cannot_be_changed(name):
     """Its formulas are recorded once, so a change would have no effect."""

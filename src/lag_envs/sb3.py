@@ -161,6 +161,8 @@ class VecEnv(vec_env.VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of all environments: they share one value in a batch."""
         self._all(indices, "set")
+        batch: Any = self.env.unwrapped
+        batch.check_settable(attr_name)
         setattr(self._owner(attr_name), attr_name, value)
 
     def env_method(

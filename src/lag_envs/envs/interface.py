@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lag_envs.scenes.checks import check_number, shown
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.imperfections import seen_box
+from lag_envs.tasks.imperfections import KEYWORDS, seen_box
 
 RENDER_MODES = ["human", "rgb_array"]
 #: The longest time for which `show_trail` shows the path [s].
@@ -46,6 +46,14 @@ class TaskEnv:
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
         self._spec = None if value is None else true_spec(value, self._limit)
+
+    def check_settable(self, name: str) -> None:
+        """Raise an AttributeError for what is decided when the environment is made."""
+        parameters = (field.name for field in dataclasses.fields(self.task.scene))
+        if name in ("task", "scene", "dt", "duration", *KEYWORDS, *parameters):
+            raise AttributeError(
+                f"{name} cannot be set once the environment is made; make another one with other keywords"
+            )
 
     @property
     def _drawn(self) -> list[str]:

@@ -118,6 +118,11 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._known: tuple[dict[str, float], Task] = {}, self.task
         self._bind()
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_known" in vars(self) and not hasattr(type(self), name):
+            self.check_settable(name)
+        super().__setattr__(name, value)
+
     def _bind(self) -> None:
         self._step = self._program.step_one
         self._viewer: Any = None
