@@ -18,9 +18,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import Field
 
-from agents.learners import Count, LearnerSettings, trainable
+from agents.learners import LAYERS, Count, LearnerSettings, Width, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.controllers import build
@@ -42,7 +42,9 @@ class Settings(LearnerSettings):
     n_updates: int = Field(ge=1, description="minibatches of an update")
     batch_size: int = Field(ge=1, description="steps of a minibatch, drawn from all collected data")
     learning_rate: float = Field(ge=0, description="Adam's step size at the start; falls linearly to 0")
-    actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
+    actor: list[Width] = Field(
+        min_length=1, max_length=LAYERS, description="widths of the policy's hidden layers"
+    )
     first_layer_scale: float = Field(gt=0, description="factor of the first layer's weights at the start")
 
 

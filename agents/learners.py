@@ -42,7 +42,7 @@ from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
 from lag_envs.host import machine
 from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
-from lag_envs.leaderboard import export
+from lag_envs.leaderboard import export, protocol
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.leaderboard.sb3_models import ModelPolicy
 from lag_envs.scores import known_returns, score
@@ -70,6 +70,10 @@ SCALE = "lag_envs.sb3.ScaledReward"
 #: Upper limits of the numbers of environments, steps between updates, and frames: more would hardly fit into
 #: memory.
 Count = Annotated[int, Field(ge=1, le=100_000)]
+#: Frames, and width and number of hidden layers of our own policies: what the leaderboard, and so
+#: `lag-envs watch`, accepts.
+Frames = Annotated[int, Field(ge=1, le=protocol.FRAMES)]
+Width, LAYERS = Annotated[int, Field(gt=0, le=protocol.WIDTH)], protocol.LAYERS
 #: The argument of each wrapper that is known, and its type.
 WRAPPERS: Mapping[str, tuple[str, Any]] = {
     TIME_LIMIT: ("max_episode_steps", PositiveInt),

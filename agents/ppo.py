@@ -24,7 +24,7 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, get_origin
 
 import gymnasium as gym
 import numpy as np
@@ -34,7 +34,7 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
-from agents.learners import Count, LearnerSettings, check_rewards, trainable
+from agents.learners import LAYERS, Count, Frames, LearnerSettings, Width, check_rewards, trainable
 from agents.run import CHECKPOINT, first_training_seed, reports_errors
 from agents.train import add_run_options, here, planned_runs, train_all
 from lag_envs.envs.stagger import stagger
@@ -72,8 +72,10 @@ class Settings(LearnerSettings):
     state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
     noise_steps: int = Field(ge=1, description="steps for which this noise is held")
     log_std_init: float = Field(ge=-20, le=5, description="log standard deviation of actions at the start")
-    frames: Count = Field(description="number of last observations that actor and critic see")
-    actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
+    frames: Frames = Field(description="number of last observations that actor and critic see")
+    actor: list[Width] = Field(
+        min_length=1, max_length=LAYERS, description="widths of the policy's hidden layers"
+    )
     critic: list[PositiveInt] = Field(min_length=1, description="widths of the critic's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
 
@@ -428,7 +430,7 @@ def parser() -> argparse.ArgumentParser:
     for name in OPTIONS:
         field = Settings.model_fields[name]
         kind: Any = {float: float, bool: yes_or_no}.get(field.annotation, int)
-        many: Any = {"nargs": "+"} if field.annotation == list[PositiveInt] else {}
+        many: Any = {"nargs": "+"} if get_origin(field.annotation) is list else {}
         group.add_argument(
             "--" + name.replace("_", "-"), type=kind, metavar="X", help=field.description, **many
         )

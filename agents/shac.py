@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
-from agents.learners import Count, LearnerSettings, check_rewards, trainable
+from agents.learners import LAYERS, Count, LearnerSettings, Width, check_rewards, trainable
 from agents.ppo import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.torch import Step
@@ -66,7 +66,9 @@ class Settings(LearnerSettings):
     episode_share: float = Field(gt=0, le=1, description="share of its length after which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
     start_ranges: dict[str, NonNegativeFloat] = Field(description="half widths of random starts")
-    actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
+    actor: list[Width] = Field(
+        min_length=1, max_length=LAYERS, description="widths of the policy's hidden layers"
+    )
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
     critic: list[PositiveInt] = Field(description="widths of the critic's hidden layers; empty: no critic")
     critic_rate: float = Field(ge=0, description="learning rate of the critic")

@@ -243,7 +243,7 @@ def test_watch_takes_agents_by_name_and_by_file(tmp_path):
         with pytest.raises(UserError, match=re.escape(message)):
             watch.load_agent(task.id, task, name)
     (tmp_path / "broken.zip").write_bytes(b"PK")
-    with pytest.raises(UserError, match="is not a model of Stable-Baselines3"):
+    with pytest.raises(UserError, match="nor a model of Stable-Baselines3"):
         watch.load_agent(task.id, task, str(tmp_path / "broken.zip"))
     (tmp_path / "model.zip").touch()
     (tmp_path / "result.json").write_text('{"env": "Other-v0"}')

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import shutil
 
 import numpy as np
@@ -10,6 +11,7 @@ from covering import slow
 from small_submissions import ABOUT, ENV, network
 
 from agents import measure
+from agents.run import CHECKPOINT
 from lag_envs import sb3_policies
 from lag_envs.errors import UserError
 from lag_envs.leaderboard import export
@@ -214,15 +216,43 @@ def test_models_that_cannot_be_exported(runs, tmp_path):
         export.find([tmp_path])
     source = export.Source(tmp_path / "x.zip")
     source.model.write_bytes(b"no zip")
-    with pytest.raises(export.ExportError, match="not a model of Stable-Baselines3"):
+    with pytest.raises(export.ExportError, match="nor a model of Stable-Baselines3"):
         export.export([source], tmp_path / "a", authors=["A"], license="MIT", env=ENV, seconds=1)
     with pytest.raises(export.ExportError, match="at least 5 policies"):
         export.export(export.find([runs / "seed0"]), tmp_path / "a", authors=["A"], license="MIT")
+    for content in (b"", b"no zip"):
+        source.model.write_bytes(content)
+        with pytest.raises(export.ExportError, match=r"x\.zip is neither a network of ours nor a model of"):
+            export.algorithm_of(source)
+        assert export.arrays_of(source.model) is None
+    for arrays in ({"weight_0": np.ones((4, 1))}, {"weight_0": np.ones(1), "bias_0": np.array("a")}):
+        with source.model.open("wb") as file:
+            np.savez(file, choices=np.zeros(0), **arrays)
+        with pytest.raises(export.ExportError, match=r"x\.zip is damaged: it should hold weight_0, bias_0"):
+            export.arrays_of(source.model)
+    made, _ = model("PPO")
+    with torch.no_grad():
+        made.policy.action_net.weight[0, 0] = math.nan
+    made.save(source.model)
+    with pytest.raises(export.ExportError, match=r"x\.zip: weight_\d has entries that are not finite"):
+        export.exported(source, ENV)
+    (tmp_path / "norm.pkl").write_bytes(b"")
+    with pytest.raises(export.ExportError, match=r"norm\.pkl cannot be read for PPO: EOFError"):
+        export.exported(export.Source(source.model, tmp_path / "norm.pkl"), ENV)
     made, _ = model("PPO", policy_kwargs={"net_arch": [7]})
     made.save(tmp_path / "other.zip")
     sources = [*export.find([runs / "seed0"]), export.Source(tmp_path / "other.zip")]
     with pytest.raises(export.ExportError, match="networks differ"):
         export.export(sources, tmp_path / "a", authors=["A"], license="MIT", seconds=1.0)
+
+
+def test_a_run_that_is_not_finished_is_named(runs, tmp_path):
+    shutil.copytree(runs, tmp_path / "runs")
+    assert len(export.find([tmp_path / "runs"])) == len(export.find([runs]))
+    (tmp_path / "runs" / "seed9").mkdir()
+    (tmp_path / "runs" / "seed9" / CHECKPOINT).touch()
+    with pytest.raises(export.ExportError, match=r"seed9: not finished; resume the training, or name"):
+        export.find([tmp_path / "runs"])
 
 
 # --- our own agents ---

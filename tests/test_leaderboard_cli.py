@@ -147,6 +147,17 @@ def test_withdraw(run):
     assert run("withdraw", id, "--reason", "wrong numbers")[0] == 0
     assert f"{id} withdrawn: wrong numbers" in run("list")[1]
     assert run("withdraw", id, "--reason", "x") == (2, "", f"lag-envs: error: {id} was withdrawn before\n")
+    assert f"{id}: had been withdrawn and is on the board again, verified" in run("add", "a")[1]
+
+
+@pytest.mark.parametrize("command", [["list"], ["add", "a"], ["build", "site"]])
+def test_an_emptied_log_is_no_new_board(command, run):
+    write("a")
+    run("add", "a", "--nonce", "n")
+    Path("leaderboard/board.jsonl").write_bytes(b"")
+    status, _, err = run(*command)
+    assert status == 2 and "board.jsonl is empty, though there are submissions; " in err
+    assert err.count("is empty") == 1 and not Path("site").exists()
 
 
 def test_mistakes(run):

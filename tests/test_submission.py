@@ -31,6 +31,24 @@ def test_what_is_written_is_read(tmp_path):
             assert not policy.arrays[name].flags.writeable
 
 
+def test_numpys_numbers_are_written(tmp_path):
+    curve = {"seed": np.int64(1), "steps": np.array([0, 500]), "returns": np.array([0.5, 1.5])}
+    training = TRAINING | {"env_steps": np.int64(1000), "seconds": np.float32(2.5), "curves": [curve]}
+    made = learned(tmp_path / "a", training=training, arrays={np.int64(s): net(s) for s in range(5)})
+    assert made.training["env_steps"] == 1000 and made.training["curves"][0]["steps"] == [0, 500]
+    assert [seed for seed, _ in made.policies] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("wrong", [np.ones(1, complex), np.array(["a"]), [[1.0], [1.0, 2.0]], object()])
+def test_what_is_no_array_of_numbers_is_named(wrong, tmp_path):
+    arrays = {s: net(s) | {"bias_0": wrong} for s in range(5)}
+    with pytest.raises(Refused, match=r"arrays\[0\]\['bias_0'\] must be an array of float32 or float64, got"):
+        learned(tmp_path / "a", arrays=arrays)
+    with pytest.raises(Refused, match=r"submission\.toml cannot be written: .*object"):
+        learned(tmp_path / "a", training=TRAINING | {"seconds": object()})
+    assert not [*tmp_path.iterdir()]
+
+
 def test_digest_is_of_the_bytes(tmp_path):
     first, again = learned(tmp_path / "a"), learned(tmp_path / "b")
     assert first.digest == again.digest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -252,6 +253,8 @@ class Video:
             raise UserError(
                 f"the folder of {path} does not exist" if not path.is_dir() else f"{path} is a folder"
             )
+        if not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
+            raise UserError(f"{path} cannot be written; choose another place")
         self.path, self.rate = path, rate
         self._gif = path.suffix.lower() == ".gif"
         #: If pictures come faster than they can be shown, only every `every`-th is kept.

@@ -380,7 +380,7 @@ class UnfusedProgram:
             of = self.task
             if own:
                 of = self._formulas.with_numbers(k)
-                of.formulas = self._formulas  # not the formulas of recorded numbers
+                vars(of)["formulas"] = self._formulas  # not the formulas of recorded numbers
             found = picture.poses_of(of, Frame(y, u, of.share(list(u)), list(g), turned), xp)
             return [x for pose in found.values() for x in pose]
 

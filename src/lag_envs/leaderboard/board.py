@@ -130,7 +130,13 @@ class Board:
             If there is no board, or its log is damaged.
         """
         self.require()
-        return fold(parse(read_log(self.log))[0])
+        return self._state(read_log(self.log))
+
+    def _state(self, content: bytes) -> BoardState:
+        """Return the state that follows from the log's content."""
+        if not content and any((self.folder / "submissions").glob("[!.]*")):
+            raise BoardError(f"{self.log} is empty, though there are submissions; {REMEDY}")
+        return fold(parse(content)[0])
 
     def submission(self, id: str) -> Path:
         """Return the folder of a submission's files."""
@@ -170,7 +176,7 @@ class Board:
             _remove(self.folder / "submissions" / ".new")
             for left in (self.folder / "results").glob("**/.*.part"):
                 _remove(left)
-            state = fold(parse(read_all(log))[0])
+            state = self._state(read_all(log))
             last = state.last
 
             def append(event: str, **told: Any) -> None:

@@ -174,6 +174,7 @@ def _add(args: argparse.Namespace) -> int:
 
     board = Board(args.board)
     there = board.exists()
+    before = board.read().entries if there else {}
     failed, added = 0, []
     for folder in args.folders:
         try:
@@ -183,7 +184,10 @@ def _add(args: argparse.Namespace) -> int:
             print(f"{ascii_text(folder)}: refused: {error}", file=sys.stderr)
             continue
         added.append(entry.id)
-        if entry.state != "pending":
+        was = before.get(entry.id)
+        if was and was.state == "withdrawn":
+            print(f"{entry.id}: had been withdrawn and is on the board again, {entry.state}")
+        elif entry.state != "pending":
             print(f"{entry.id}: is already on the board, {entry.state}")
     if not there and board.exists():
         print(f"{board.folder} is a new board")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.errors import UserError, hint
+from lag_envs.errors import UserError, hint, one_line
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import POLICY, Architecture
 from lag_envs.leaderboard.fields import accepted
@@ -47,6 +47,8 @@ ACTIVATIONS = {
 #: Largest difference of the actions of model and export.
 DIFFERENCE = 1e-5
 MODEL, NORMALISATION, RESULT = "model.zip", "vecnormalize.pkl", "result.json"
+#: Lies there until the training is finished.
+CHECKPOINT = "checkpoint.pkl"
 
 
 class ExportError(UserError):
@@ -91,6 +93,11 @@ def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
         folders = [path] if (path / MODEL).exists() else sorted(f.parent for f in path.glob(f"*/{MODEL}"))
         if not folders:
             raise ExportError(f"{path} is neither a model nor a folder with {MODEL} in it or one level below")
+        if unfinished := sorted({f.parent for f in path.glob(f"*/{CHECKPOINT}")} - set(folders)):
+            raise ExportError(
+                f"{', '.join(map(str, unfinished))}: not finished; resume the training, or name the finished "
+                "runs one by one"
+            )
         for folder in folders:
             file, norm = folder / RESULT, folder / NORMALISATION
             result = _json(file) if file.exists() else None
@@ -119,7 +126,9 @@ def algorithm_of(source: Source) -> str:
             data = json.loads(archive.read("data"))
         module = data["policy_class"]["__module__"]
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ExportError(f"{file} is not a model of Stable-Baselines3: {error}") from error
+        raise ExportError(
+            f"{file} is neither a network of ours nor a model of Stable-Baselines3: {error}"
+        ) from error
     names = [name for name, (*_, known) in ALGORITHMS.items() if known == module]
     if not names:
         raise ExportError(
@@ -148,13 +157,17 @@ def load_model(source: Source, algo: str) -> tuple[Any, Any]:
 
     module, name, _ = ALGORITHMS[algo]
     try:
-        model = getattr(import_module(module), name).load(source.model, device="cpu", **LOADING)
-        normalise = None if source.normalise is None else pickle.loads(source.normalise.read_bytes())
+        file = source.model
+        model = getattr(import_module(module), name).load(file, device="cpu", **LOADING)
+        if source.normalise is None:
+            return model, None
+        file = source.normalise
+        normalise = pickle.loads(file.read_bytes())
+        return model, normalise if normalise.norm_obs else None
     except ImportError:
         raise
-    except Exception as error:  # a file that is not a model may raise anything
-        raise ExportError(f"{source.model} cannot be read: {type(error).__name__}: {error}") from error
-    return model, normalise if normalise is not None and normalise.norm_obs else None
+    except Exception as error:  # a file of another kind may raise anything
+        raise ExportError(f"{file} cannot be read for {name}: {one_line(error)}") from error
 
 
 def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | None:
@@ -164,9 +177,12 @@ def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | No
             choices = found["choices"].tolist()
             arrays = {name: found[name] for name in found if name.startswith(("weight_", "bias_"))}
             frames = int(found.get("frames", 1))
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
-    hidden = [len(arrays[f"bias_{k}"]) for k in range(len(arrays) // 2 - 1)]
+    layers = range(len(arrays) // 2)
+    if not layers or any(np.ndim(arrays.get(f"bias_{k}", 0.0)) != 1 for k in layers):
+        raise ExportError(f"{file} is damaged: it should hold weight_0, bias_0, weight_1, bias_1 and so on")
+    hidden = [len(arrays[f"bias_{k}"]) for k in layers[:-1]]
     table: dict[str, Any] = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
     table |= {"frames": frames} if frames > 1 else {}
     return table | ({} if choices else {"squash": "clip"}), arrays
@@ -379,6 +395,9 @@ def _agent(made: Architecture, env: str, arrays: Mapping[str, NDArray[Any]]) -> 
     shapes = {key: value.shape for key, value in arrays.items()}
     if shapes != made.arrays:
         raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")
+    for key, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise Refused(f"{key} has entries that are not finite")
     return made.agent({k: v.astype(np.float64) for k, v in arrays.items()})
 
 
@@ -432,13 +451,15 @@ def export(
     """
     known = [s.result for s in sources if s.result]
     name = name or _name(sources[0], algo)
-    env = env or _same("environment", [r.get("env") for r in known], "--env")
+    env = env or _same("environment", sources, "env")
     if env not in protocol.boards():
         raise ExportError(f"there is no environment {env!r}; {hint(env, protocol.boards())}")
     if os.path.lexists(folder):
         raise ExportError(f"{folder} already exists; remove it, or choose another place")
-    if seconds is None and any("wall_seconds" not in (s.result or {}) for s in sources):
-        raise ExportError("it is not known how long a training took; give --seconds")
+    if seconds is None:
+        for source in sources:
+            if "wall_seconds" not in (source.result or {}):
+                raise ExportError(f"{source.model}: the training's time is not known; give --seconds")
     tables, arrays, curves, steps, took, off, count = [], {}, [], [], [], 0.0, 0
     for number, source in enumerate(sources):
         made = exported(source, env, algo)
@@ -480,12 +501,14 @@ def export(
     return submission, off, count
 
 
-def _same(what: str, values: Sequence[Any], option: str) -> Any:
-    if not values or None in values:
-        raise ExportError(f"the {what} is not known; give {option}")
-    if len(set(values)) > 1:
-        raise ExportError(f"the models have more than one {what}: {', '.join(map(str, sorted(set(values))))}")
-    return values[0]
+def _same(what: str, sources: Sequence[Source], key: str) -> Any:
+    """Return what is noted under a key about the trainings."""
+    values = {source.result[key] for source in sources if source.result and key in source.result}
+    if not values:
+        raise ExportError(f"the {what} is not known; give --{key}")
+    if len(values) > 1:
+        raise ExportError(f"the models have more than one {what}: {', '.join(map(str, sorted(values)))}")
+    return values.pop()
 
 
 def _curve(seed: int, points: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
@@ -551,7 +574,7 @@ def run_export(args: argparse.Namespace) -> int:
                         raise _only_for_models(option, source)
         if args.frames is not None:
             sources = [replace(source, frames=args.frames) for source in sources]
-        known = args.env or _same("environment", [(s.result or {}).get("env") for s in sources], "--env")
+        known = args.env or _same("environment", sources, "env")
         name = args.name or _name(sources[0], args.algo)
         submission, off, count = export(
             sources, args.output or Path(f"{known}-{name}".replace(" ", "-").replace("/", "-")),

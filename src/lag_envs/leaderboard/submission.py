@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
+from lag_envs.envs.interface import plain_data
 from lag_envs.errors import hint
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import Architecture
@@ -317,7 +318,8 @@ def _read(file: Path, size: int) -> bytes:
     try:
         content = read_plain(file, size)
     except OSError as error:
-        raise Refused(f"{file.name} changed while it was read: {error.strerror}") from error
+        happened = "cannot be read" if isinstance(error, PermissionError) else "changed while it was read"
+        raise Refused(f"{file.name} {happened}: {error.strerror}") from error
     if len(content) != size:
         raise Refused(f"{file.name} changed while it was read")
     return content
@@ -512,23 +514,44 @@ def write(
     told |= {
         key: text for key, text in (("kind", kind), ("code", code), ("description", description)) if text
     }
+    arrays = {
+        plain_data(seed): {key: _array(f"arrays[{seed}][{key!r}]", array) for key, array in content.items()}
+        for seed, content in arrays.items()
+    }
     if training:
         told["training"] = {"seeds": sorted(arrays), **training}
     told["policy"] = dict(policy)
+    try:
+        table = tomli_w.dumps(plain_data(told))
+    except TypeError as error:
+        raise Refused(f"{TOML} cannot be written: {error}") from error
     folder.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(folder)) from error
     try:
         part.chmod(0o755)
-        (part / TOML).write_text(tomli_w.dumps(told), encoding="utf-8", newline="\n")
+        (part / TOML).write_text(table, encoding="utf-8", newline="\n")
         for seed, content in arrays.items():
-            found = {key: np.ascontiguousarray(array) for key, array in content.items()}
-            (part / f"policy_{seed}.safetensors").write_bytes(save(found))
+            (part / f"policy_{seed}.safetensors").write_bytes(save(dict(content)))
         load(part)
         part.rename(folder)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
     return load(folder)
+
+
+def _array(name: str, given: Any) -> NDArray[Any]:
+    """Return an array of numbers; `load` checks the rest."""
+    try:
+        array = np.ascontiguousarray(given)
+    except ValueError:  # rows of different lengths
+        raise Refused(f"{name} must be an array of float32 or float64, got {shown_ascii(given)}") from None
+    if array.dtype.kind not in "fiu":
+        raise Refused(f"{name} must be an array of float32 or float64, got one of {array.dtype}")
+    return array
 
 
 def _check_kinds(env: Any, authors: Any, policy: Any, arrays: Any, training: Any) -> None:
