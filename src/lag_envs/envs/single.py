@@ -117,11 +117,15 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._ready = self._started = False
         self._known: tuple[dict[str, float], Task] = {}, self.task
         self._bind()
+        self._made = True
+
+    #: Whether everything is decided. (Looking into `__dict__` for it would slow down every later step.)
+    _made = False
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if "_known" in vars(self) and not hasattr(type(self), name):
+        if name[:1] != "_" and self._made and not hasattr(type(self), name):
             self.check_settable(name)
-        super().__setattr__(name, value)
+        object.__setattr__(self, name, value)
 
     def _bind(self) -> None:
         self._step = self._program.step_one
@@ -163,7 +167,8 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._ids[:2] = seed_key(seed), 0
         elif not self._started:
             self._ids[:2] = self.np_random.integers(2**63), 0
-        self._started = True
+        if not self._started:
+            self._started = True
         if given_state is not None:
             self._rows[: len(given_state)] = given_state
         if given_target is not None:
@@ -172,7 +177,9 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._program.start_one(
             self._rows, observation, self._ids, given_state is not None, given_target is not None
         )
-        self._ready, self._total = True, 0.0
+        self._ready = True
+        if self._seen:
+            self._total = 0.0
         if self.render_mode == "human":
             self.render()
         return observation, self._info()
