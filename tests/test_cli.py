@@ -228,7 +228,8 @@ def test_watch_takes_agents_by_name_and_by_file(tmp_path):
     observation = np.zeros((1, 4), np.float32)
     entries = [e for e in Board(board).read().entries.values() if e.env == task.id and e.name == "PPO"]
     folder = Board(board).submission(entries[-1].id)
-    for name in (None, "ppo", "LQR", "zero", "random", str(folder)):
+    files = [str(folder / file) for file in ("submission.toml", "policy_0.safetensors")]
+    for name in (None, "ppo", "LQR", "zero", "random", str(folder), *files):
         _, agent = watch.load_agent(task.id, task, name)
         assert agent.predict(observation)[0].shape == (1, 1), name
     assert watch.load_agent(task.id, task, entries[-1].id, board)[0] == entries[-1].id

@@ -99,8 +99,9 @@ def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = No
             f"{env_id} has no agent {name!r}, and there is no such file{more}; "
             f"{hint(name, [*names.values(), *on_board])}"
         )
-    if (path / "submission.toml").is_file():
-        return path.name, _submission(env_id, path)
+    folder = path.parent if path.name == "submission.toml" or path.suffix == ".safetensors" else path
+    if (folder / "submission.toml").is_file():
+        return folder.absolute().name, _submission(env_id, folder)
     return path.name, _model(env_id, task, path)
 
 
