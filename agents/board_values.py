@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.optimum import DEFAULT_FOLDER, Solution, solved_for
 from agents.run import check_env, reports_errors
+from agents.solution import DEFAULT_FOLDER, Solution, solved_for
 from lag_envs import TASKS
 from lag_envs.options import module_parser
 from lag_envs.store import write_file

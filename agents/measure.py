@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.analysis import Data
-from agents.optimum import RESULTS, GreedyPolicy, played
 from agents.run import (
     FIRST_FRESH_SEED,
     MODEL,
@@ -29,6 +28,7 @@ from agents.run import (
     fresh_seeds,
     read_result,
 )
+from agents.solution import RESULTS, GreedyPolicy, played
 from lag_envs import TASKS, __version__, controllers, store
 from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
 from lag_envs.evaluation.rollout import Meter, Rollout, RolloutStep, observation_std
@@ -209,7 +209,7 @@ class Evaluation:
         if reason := no_optimum(self.env):
             self.absent.append(f"optimal: {reason}")
         else:
-            mark = digest("optimum.py", "value_iteration.py", RESULTS / f"{self.env}.json")
+            mark = digest("solution.py", "value_iteration.py", RESULTS / f"{self.env}.json")
             self.entrants.append(
                 Entrant(self.env, "optimal", "optimal", partial(GreedyPolicy, self.env), mark)
             )

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from agents.learners import learner_label
 from agents.measure import Entrant, learned_policy
-from agents.optimum import GreedyPolicy, played
 from agents.results import ROOT, write_envs
 from agents.run import RESULT, UserError, check_env, check_numbers, read_result, reports_errors
+from agents.solution import GreedyPolicy, played
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play

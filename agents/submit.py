@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.learners import OWN, learner_label
-from agents.optimum import DEFAULT_FOLDER, Solution, nodes, played, solvable
 from agents.run import MODEL, check_env, reports_errors
+from agents.solution import DEFAULT_FOLDER, Solution, nodes, played, solvable
 from agents.value_iteration import CacheError
 from lag_envs import TASKS
 from lag_envs.controllers import controllers

@@ -263,7 +263,7 @@ def test_optimal_table_is_the_value_function(env, tmp_path):
     pytest.importorskip("tqdm")
     from dataclasses import replace as replaced
 
-    from agents.optimum import GreedyPolicy, Solution
+    from agents.solution import GreedyPolicy, Solution
     from agents.submit import tabulate
 
     problem = TASKS[env].value_iteration

@@ -20,8 +20,9 @@ from scipy.optimize import brentq, minimize_scalar
 
 import lag_envs
 from agents import optimum
-from agents.optimum import IMAGES, RESULTS, GreedyPolicy, Solution, extrapolated, grid, played, solvable
+from agents.optimum import IMAGES, RESULTS, extrapolated
 from agents.run import fresh_seeds
+from agents.solution import GreedyPolicy, Solution, grid, nodes, played, solvable
 from agents.value_iteration import (
     PROGRESS,
     VALUES,
@@ -367,7 +368,7 @@ def test_between_targets_values_are_interpolated():
     at_node = np.array([[axes[0][i], axes[1][j], axes[2][k]]])
     assert solution.value(0, at_node, np.array([first]))[0] == solution.values[1][0, i, j, k]
     middle, between = at_node.copy(), 0.5 * (first + second)
-    middle[0, 0] = optimum.nodes(solution.problem.axes[0], 0.25, between)[i]
+    middle[0, 0] = nodes(solution.problem.axes[0], 0.25, between)[i]
     expected = 0.5 * (solution.values[1][0, i, j, k] + solution.values[2][0, i, j, k])
     assert solution.value(0, middle, np.array([between]))[0] == pytest.approx(expected, rel=1e-6)
     assert solution.value(0, -middle, np.array([-between]))[0] == pytest.approx(expected, rel=1e-6)
