@@ -622,6 +622,19 @@ def test_parameters_of_sympys_expressions_are_numbers(number):
         Scene.from_sympy("Odd", m * q_dot**2, q**2, coordinates={q: "m"}, parameters={m: number})
 
 
+def test_names_that_sympy_knows_are_the_declared_ones():
+    """In a text, E would be 2.718..., and N and S functions of SymPy."""
+    named = {"coordinates": {"E": "m"}, "controls": {"N": "N"}, "parameters": {"S": 3.0, "beta": 2.0}}
+    scene = Scene.from_sympy("Text", "beta*E_dot**2", "S*E", applied={"E": "N"}, **named)
+    assert scene.acceleration([0.5, 0.0], 1.0)["E"] == -0.5
+    one, other = sympy.Symbol("m"), sympy.Symbol("m", positive=True)
+    for twice in ({one: 1.0, other: 2.0}, {one: 1.0, "m": 2.0}):
+        with pytest.raises(
+            FormulaError, match=r"Text\.parameters: m is declared twice; give one another name"
+        ):
+            Scene.from_sympy("Text", "m*x_dot**2", "x**2", coordinates={"x": "m"}, parameters=twice)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

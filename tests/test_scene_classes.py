@@ -173,6 +173,49 @@ def test_parameter_made_from_others():
     assert Uniform(inertia=4.0).mass_matrix([0.0, 0.0]) == 4.0
 
 
+def test_a_parameter_made_from_a_later_one_is_named():
+    class Late(PivotedBar):
+        half: float = parameter(lambda s: None if s.double is None else 0.25 * s.double, "kg")
+        double: float = parameter(lambda s: 2.0 * s.mass, "kg")
+
+    with pytest.raises(FormulaError, match=r"Late.half: it uses double, .* declare double before"):
+        Late()
+    assert Late(double=1.0).half == 0.25
+
+
+def test_a_derived_class_may_begin_in_another_mode():
+    tilted = type("Tilted", (Incline,), {"control": "tilt"})
+    for scene in (tilted(), type("Again", (tilted,), {})(), copy.deepcopy(tilted())):
+        assert (scene.control, scene.control_names) == ("tilt", ("phi",))
+    assert tilted(control="tilt_rate").control == "tilt_rate"
+
+
+def test_a_yes_or_no_is_a_bool():
+    kind = type("Sprung", (PivotedBar,), {"__annotations__": {"spring": "bool"}, "spring": True})
+    assert kind(spring=np.False_).spring == np.False_
+    with pytest.raises(ValueError, match="spring must be True or False, got 'no'"):
+        kind(spring="no")
+
+
+@pytest.mark.parametrize("value", [50.0, parameter(50.0, "kg")])
+def test_a_parameter_in_a_class_that_is_no_scene_is_named(value):
+    mixin = type("Heavy", (), {"mass": value})
+    with pytest.raises(FormulaError, match=r"Mixed.mass: Heavy is no scene, so this has no effect; declare"):
+        type("Mixed", (mixin, PivotedBar), {})()
+
+
+def test_what_nothing_calls_is_noticed():
+    rub = {"friction": lambda self, q, v, u, xp: v.theta**2}
+    with pytest.warns(
+        UserWarning, match=r"nothing uses Rubbed.friction, though it takes xp as the formulas of"
+    ):
+        type("Rubbed", (PivotedBar,), rub)()
+    with pytest.raises(FormulaError, match=r"Own._point hides an attribute of every scene"):
+        type("Own", (PivotedBar,), {"_point": lambda self, q, xp: q.theta})()
+    with pytest.raises(FormulaError, match=r"Own.check must raise a ValueError or return nothing, got False"):
+        type("Own", (PivotedBar,), {"check": lambda self: False})()
+
+
 def test_check_may_fill_in_as_before():
     class Uniform(cart(False)):
         inertia: float = parameter(None, "kg m²", least=0.0)

@@ -1,6 +1,7 @@
 """Errors that commands show without a traceback, and hints for names that do not exist."""
 
 import difflib
+import inspect
 import os
 import re
 import signal
@@ -167,6 +168,9 @@ def warn_of_misspelt(kind: type, base: type, instead: Mapping[str, str] = Mappin
             if name in instead or close:
                 meant = f"write {instead[name]}" if name in instead else f"did you mean {close[0]}?"
                 warnings.warn(f"nothing uses {c.__name__}.{name}; {meant}", UserWarning, stacklevel=2)
+            elif inspect.isfunction(vars(c)[name]) and "xp" in inspect.signature(vars(c)[name]).parameters:
+                known_as = f"though it takes xp as the formulas of a {base.__name__} do; is its name right?"
+                warnings.warn(f"nothing uses {c.__name__}.{name}, {known_as}", UserWarning, stacklevel=2)
 
 
 def _names_in(value: Any) -> Iterator[str]:

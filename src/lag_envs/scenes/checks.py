@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_names
 
 Array = NDArray[np.float64]
@@ -39,6 +40,15 @@ def shown(value: Any) -> str:
     """Return a value as text for an error message, shortened if it is long."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:150]}... ({len(text)} characters)"
+
+
+def run_check(of: Any) -> None:
+    """Run the own `check` of a scene or a task."""
+    returned = of.check()
+    if returned is not None:
+        raise FormulaError(
+            f"{type(of).__name__}.check must raise a ValueError or return nothing, got {shown(returned)}"
+        )
 
 
 def check_number(name: str, value: Any, unit: str = "", *, endless: bool = False) -> float:

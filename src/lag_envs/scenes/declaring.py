@@ -105,7 +105,8 @@ def declare_scene(cls: Any, meta: type[type]) -> None:
             faults.append(
                 f"{name} replaces a field without an annotation; write {name}: float = parameter(...)"
             )
-    if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
+    has_modes = isinstance(own.get("modes"), Mapping) and bool(own["modes"])
+    if "control" not in annotations and (has_modes or ("control" in own and "control" in inherited)):
         annotations["control"] = "str"
         if "control" not in own:
             cls.control = next(iter(own["modes"]))

@@ -21,7 +21,7 @@ from lag_envs.mechanics.layout import SceneLayout, check_name
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import Record, Values, parameter_names
 from lag_envs.scenes import picture
-from lag_envs.scenes.checks import shown
+from lag_envs.scenes.checks import run_check, shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
 from lag_envs.scenes.derivation import layout_of, structure_of
 from lag_envs.scenes.parameters import fill_in
@@ -61,7 +61,7 @@ def admit(scene: Any, base: type) -> None:
         if not isinstance(mode, str) or mode not in scene.modes:
             raise ValueError(f"control must be one of {', '.join(scene.modes)}, got {shown(mode)}")
     fill_in(scene)
-    scene.check()
+    run_check(scene)
     try:
         key = structure_of(scene)
         known = _admitted.setdefault(type(scene), {}).get(key)
@@ -95,6 +95,12 @@ def check_class(cls: type, base: type) -> None:
             )
         if "shapes" in vars(c):
             raise FormulaError(f"{of}.shapes: {picture.INSTEAD_OF_SHAPES}")
+        if not issubclass(c, base) and "__dataclass_fields__" not in vars(c):
+            for name, value in vars(c).items():
+                if isinstance(value, dataclasses.Field) or name in getattr(cls, "__dataclass_fields__", ()):
+                    raise FormulaError(
+                        f"{of}.{name}: {c.__name__} is no scene, so this has no effect; declare it in {of}"
+                    )
     faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
     if faults:
         raise FormulaError(f"{of}.{faults[0]}")
@@ -110,7 +116,8 @@ def _check_names(scene: Any, base: type) -> None:
     public = {name for name in dir(base) if not name.startswith("_")}
     for c in cls.__mro__[: cls.__mro__.index(base)]:
         for name in (*own_annotations(c), *vars(c)):
-            if name in public and name not in DEFINED:
+            inner = name[:1] == "_" != name[-1:] and callable(vars(base).get(name))
+            if inner or (name in public and name not in DEFINED):
                 raise FormulaError(f"{of}.{name} hides an attribute of every scene; choose another name")
     warn_of_misspelt(cls, base)
     layout = layout_of(scene)

@@ -8,9 +8,11 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import formula
-from lag_envs.scenes.checks import SMALLEST, check_number
+from lag_envs.scenes.checks import SMALLEST, check_number, shown
 
 
 def parameter(
@@ -78,12 +80,29 @@ def fill_in(scene: Any) -> None:
         value = getattr(scene, field.name)
         if field in made:
             others = [f.name for f in dataclasses.fields(scene) if f is not field]
+            waiting = [f.name for f in made[made.index(field) :]]
             with formula(scene, field.name, others):
-                value = field.metadata["made"](scene)
+                value = field.metadata["made"](_Known(scene, waiting))
             value = None if value is None else _check_made(field, value)
         elif value is not None or not field.metadata["optional"]:
             value = _check_range(field, value)
         object.__setattr__(scene, field.name, value)
+    for other in dataclasses.fields(scene):
+        value = getattr(scene, other.name)
+        if type(other.default) is bool and not isinstance(value, bool | np.bool_):
+            raise ValueError(f"{other.name} must be True or False, got {shown(value)}")
+
+
+class _Known:
+    """A scene some of whose parameters have no value yet."""
+
+    def __init__(self, scene: Any, waiting: list[str]) -> None:
+        self._scene, self._waiting = scene, waiting
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self._waiting:
+            raise FormulaError(f"it uses {name}, which follows only later; declare {name} before")
+        return getattr(self._scene, name)
 
 
 def _check_range(field: dataclasses.Field, value: Any) -> float:

@@ -159,7 +159,8 @@ def from_sympy(
         "prescribed": prescribed,
         "parameters": parameters,
     }
-    items = []
+    items: list[tuple[str, tuple]] = []
+    known: dict[str, Any] = {}
     for what, given in {**maps, "applied": applied or {}}.items():
         try:
             pairs = [(_symbol(key), value) for key, value in dict(given).items()]
@@ -173,9 +174,14 @@ def from_sympy(
             elif not isinstance(value, Hashable):
                 wanted = "an expression" if what == "applied" else "a unit"
                 raise FormulaError(f"{name}.{what}: {_name(key)} must have {wanted}, got {value!r:.60}")
+            elif what == "applied":  # SymPy has other meanings for names such as E in a text
+                pairs[i] = key, sympy.sympify(value, known)
+        for key, _ in pairs if what in maps else ():
+            if known.setdefault(_name(key), key) != key or [k for k, _ in pairs].count(key) > 1:
+                raise FormulaError(f"{name}.{what}: {_name(key)} is declared twice; give one another name")
         items.append((what, tuple(pairs)))
     formulas = tuple(
-        (what, sympy.sympify(e))
+        (what, sympy.sympify(e, known))
         for what, e in (("kinetic", kinetic), ("potential", potential), ("dissipation", dissipation))
     )
     return _scene_type(base, name, tuple(items), formulas)()
@@ -187,7 +193,7 @@ def _scene_type(base: type[Scene], name: str, items: tuple, formulas: tuple) -> 
     given = {what: dict(pairs) for what, pairs in items}
     expressions = dict(formulas)
     named = {what: {_name(key): value for key, value in of.items()} for what, of in given.items()}
-    applied = {key: sympy.sympify(value) for key, value in named["applied"].items()}
+    applied = named["applied"]
     # The controls come first: a control that sets a place or a rate is read as that place or rate.
     places: dict[Any, tuple[str, str]] = {symbol: ("u", _name(symbol)) for symbol in given["controls"]}
     places |= {symbol: ("self", _name(symbol)) for symbol in given["parameters"]}

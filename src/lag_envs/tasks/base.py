@@ -21,7 +21,7 @@ from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import Scene
-from lag_envs.scenes.checks import check_number, check_state, real_array, shown
+from lag_envs.scenes.checks import check_number, check_state, real_array, run_check, shown
 from lag_envs.scenes.declaring import ORDER, complete
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, structure_of
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
@@ -250,7 +250,7 @@ class Task(_Made):
             name = f"duration ({of}.steps * {of}.interval)" if duration is None else "duration"
             raise ValueError(f"{name} must be at least dt={self.dt:g} s, got {self.duration:g} s")
         self.fixed_target: NDArray[np.float64] | None = None
-        self.check()
+        run_check(self)
         self.check_usable()
         _ = self.formulas
         if target is not None:
