@@ -190,6 +190,29 @@ def test_a_derived_class_may_begin_in_another_mode():
     assert tilted(control="tilt_rate").control == "tilt_rate"
 
 
+def test_an_attribute_of_instances_is_noticed_beside_large_numbers():
+    """What is allowed for rounding follows a formula's own parameters."""
+
+    class Stiff(cart(False)):
+        modulus: float = parameter(2e11, "Pa", above=0.0)
+        area: float = parameter(1e-11, "m", above=0.0)
+        extra = 100.0
+
+        def __post_init__(self):
+            object.__setattr__(self, "extra", self.mass)
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * self.extra * v.x**2
+
+        def potential(self, q, xp):
+            return 0.5 * self.modulus * self.area * q.x**2
+
+    with pytest.raises(
+        FormulaError, match=r"Stiff.kinetic gives another result on plain .* in __post_init__"
+    ):
+        Stiff()
+
+
 def test_a_yes_or_no_is_a_bool():
     kind = type("Sprung", (PivotedBar,), {"__annotations__": {"spring": "bool"}, "spring": True})
     assert kind(spring=np.False_).spring == np.False_

@@ -163,11 +163,17 @@ def _check_on_numbers(scene: Any, found: Mechanics) -> None:
     """Raise a FormulaError if a formula gives something else on plain numbers than what was recorded.
 
     This happens if a formula asks for a parameter's type or text. Each formula is tried at two points. An
-    allowance is made for rounding: where terms cancel in the record, plain numbers may leave a little.
+    allowance is made for rounding: where terms cancel in the record, plain numbers may leave a little of the
+    squares of a formula's parameters, or of a parameter that drops out.
     """
     layout, parameters = found.layout, recording.parameter_values(scene)
     largest = max(map(abs, parameters.values()), default=0.0)
     names = [(name, x) for name, exprs in found.record.by_formula().items() for x in exprs]
+    read = [{s.name for s in x.symbols() if s.kind == "parameter"} for _, x in names]
+    allowed = [
+        1e-15 * (largest + max((parameters[p] ** 2 for p in own if p in parameters), default=0.0))
+        for own in read
+    ]
     alike: list[set[bool]] = [set() for _ in names]
     for first, step in ((0.37, 0.11), (1.3, -0.23)):
         numbers = {name: np.float64(first + step * i) for i, name in enumerate(layout.names)}
@@ -184,15 +190,15 @@ def _check_on_numbers(scene: Any, found: Mechanics) -> None:
                 plain = _on_numbers(scene, q, v, u)
         except ArithmeticError:  # there it has no value
             continue
-        for outcomes, parts, x in zip(alike, terms, plain, strict=True):
+        for outcomes, parts, x, rounding in zip(alike, terms, plain, allowed, strict=True):
             total, size = sum(parts), sum(map(abs, parts))
             if not isinstance(x, complex) and math.isfinite(size) and math.isfinite(x):
-                outcomes.add(bool(abs(x - total) <= 1e-6 * size + 1e-15 * largest**2))
+                outcomes.add(bool(abs(x - total) <= 1e-6 * size + rounding))
     for (name, _), outcomes in zip(names, alike, strict=True):
         if outcomes == {False}:
             raise FormulaError(
                 f"{type(scene).__name__}.{name} gives another result on plain numbers than on recorded ones; "
-                "it must not depend on the type or the text of a number"
+                "it must not depend on the type or the text of a number, nor on an attribute set in __post_init__"
             )
 
 
