@@ -198,7 +198,7 @@ def _check_on_numbers(scene: Any, found: Mechanics) -> None:
         if outcomes == {False}:
             raise FormulaError(
                 f"{type(scene).__name__}.{name} gives another result on plain numbers than on recorded ones; "
-                "it must not depend on the type or the text of a number, nor on an attribute set in __post_init__"
+                "it must not depend on the type or the text of a number, nor on what is set in __post_init__"
             )
 
 
