@@ -178,7 +178,7 @@ def test_a_parameter_made_from_a_later_one_is_named():
         half: float = parameter(lambda s: None if s.double is None else 0.25 * s.double, "kg")
         double: float = parameter(lambda s: 2.0 * s.mass, "kg")
 
-    with pytest.raises(FormulaError, match=r"Late.half: it uses double, .* declare double before"):
+    with pytest.raises(FormulaError, match=r"Late.half: it uses double, .* declare double first"):
         Late()
     assert Late(double=1.0).half == 0.25
 

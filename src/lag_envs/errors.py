@@ -144,8 +144,9 @@ def _without_version(name: str) -> str:
 def warn_of_misspelt(kind: type, base: type, instead: Mapping[str, str] = MappingProxyType({})) -> None:
     """Warn of names in a class that resemble names of its base and that no method of the class uses.
 
-    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation. Base
-    classes from this package are not searched.
+    Such a name would be ignored without a word: with ``disipation`` there would be no dissipation. A method
+    that takes ``xp``, as formulas do, is named whatever it is called. Base classes from this package are not
+    searched.
 
     Parameters
     ----------
@@ -169,8 +170,8 @@ def warn_of_misspelt(kind: type, base: type, instead: Mapping[str, str] = Mappin
                 meant = f"write {instead[name]}" if name in instead else f"did you mean {close[0]}?"
                 warnings.warn(f"nothing uses {c.__name__}.{name}; {meant}", UserWarning, stacklevel=2)
             elif inspect.isfunction(vars(c)[name]) and "xp" in inspect.signature(vars(c)[name]).parameters:
-                known_as = f"though it takes xp as the formulas of a {base.__name__} do; is its name right?"
-                warnings.warn(f"nothing uses {c.__name__}.{name}, {known_as}", UserWarning, stacklevel=2)
+                like = f"though it takes xp as the formulas of a {base.__name__} do; is its name right?"
+                warnings.warn(f"nothing uses {c.__name__}.{name}, {like}", UserWarning, stacklevel=2)
 
 
 def _names_in(value: Any) -> Iterator[str]:

@@ -101,7 +101,7 @@ class _Known:
 
     def __getattr__(self, name: str) -> Any:
         if name in self._waiting:
-            raise FormulaError(f"it uses {name}, which follows only later; declare {name} before")
+            raise FormulaError(f"it uses {name}, which is computed later; declare {name} first")
         return getattr(self._scene, name)
 
 

@@ -64,15 +64,13 @@ def check_definition(kind: type, base: type) -> None:
 def _fault(base: type, name: str, value: Any) -> str:
     """Return what is wrong with a class's attribute, if anything."""
     if name in ("dt", "duration"):
-        return (
-            f"is a keyword of environments; in a class, write {'interval [s]' if name == 'dt' else 'steps'}"
-        )
+        instead = "interval [s]" if name == "dt" else "steps"
+        return f"is a keyword of environments; in a class, write {instead}"
     defined = name in METHODS or name in inspect.get_annotations(base) or name.startswith("_")
     if name in ("given", "fixed_target") or (hasattr(base, name) and not defined):
         return "hides an attribute of every task; choose another name"
-    if (value is None and name in KINDS) or hasattr(
-        value, "__get__"
-    ):  # a method, or computed when it is read
+    is_read = hasattr(value, "__get__")  # a method, or a property
+    if is_read or (value is None and name in KINDS):
         return ""
     got = f"got {value!r:.60}"
     if inspect.isfunction(vars(base).get(name)) and not callable(value):
@@ -86,6 +84,7 @@ def _fault(base: type, name: str, value: Any) -> str:
 
 
 def _check_kick(kind: Any, base: Any) -> None:
+    """Raise a FormulaError if a kick has no random numbers, or random numbers have no kick."""
     counted = any("draws" in vars(c) for c in kind.__mro__[: kind.__mro__.index(base)])
     if kind.kick is not base.kick and not counted:
         raise FormulaError(
