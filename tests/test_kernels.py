@@ -20,7 +20,8 @@ from lag_envs.device import DeviceEnvs
 from lag_envs.envs.kernels import APART, kernels_of
 from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
-from lag_envs.tasks import TASKS, cart_pole, pivoted_bar
+from lag_envs.stepping.driver import LARGEST_COUNT
+from lag_envs.tasks import TASKS, cart_pole, chain, pivoted_bar
 from lag_envs.torch import TorchVectorEnv
 
 pytestmark = needs_compiler
@@ -261,6 +262,17 @@ def test_text_does_not_depend_on_numbers():
     assert a == b != c
 
 
+def test_loops_are_unrolled_where_registers_hold_the_coefficients():
+    """The loop over substeps never is."""
+    long = chain.SwingUpTriple()
+    for task, single, unrolled in ((BAR(), False, True), (long, False, False), (long, True, True)):
+        source = kernels_of(task, single).source
+        assert ('#define UNROLL _Pragma("unroll")' in source) == unrolled
+        loops = [line.strip() for line in source.splitlines() if "for (int k" in line]
+        assert sum(line.startswith("UNROLL for") for line in loops) >= len(loops) - 2 > 5
+        assert f" < {LARGEST_COUNT};" in loops[0] and loops[0].startswith("for")
+
+
 @pytest.mark.gpu
 def test_nvrtc_compiles_it():
     pytest.importorskip("cuda.bindings.nvrtc")
@@ -290,6 +302,7 @@ def test_the_benchmark_measures_both_precisions(monkeypatch):
     assert report["bandwidth"] > 0.0
     numbers = ("steps", "share", "replayed", "replayed_share")
     assert all(r[name] > 0.0 for r in report["rows"] for name in numbers)
+    assert not any("gymnax" in r for r in report["rows"])  # which is measured on a GPU only
     # State, its cosine and sine, control there and back, action, reward; two observations, age, four flags.
     assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 7 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 4
 
@@ -322,12 +335,15 @@ def test_its_results_can_be_read(tmp_path):
         for p, s in (("float32", 3e4), ("float64", 1e4))
         for n in (4, 2**20)
     ]
+    rows[1]["gymnax"] = 3e10
+    versions = {"torch": "2", "gymnax": "1.0", "jax": "0.11"}
     report = {
-        "date": "2020-02-20", "gpu": "G", "versions": {"torch": "2"}, "bandwidth": 3e12, "rows": rows,
+        "date": "2020-02-20", "gpu": "G", "versions": versions, "bandwidth": 3e12, "rows": rows,
         "settings": {"sizes": [4, 2**20], "rounds": 9, "seconds": 0.05}, "complete": True,
     }  # fmt: skip
     lines = gpu.console_lines(report)
-    assert "G, bandwidth 3.00 TB/s" in lines[0] and len(lines) == 3 + len(rows)
+    assert "G, bandwidth 3.00 TB/s" in lines[0] and len(lines) == 3 + len(rows) + 3
+    assert lines[-1].split() == [BAR.id, "1,048,576", "62.9", "G", "30.0", "G", "2.1"]
     found = f"{BAR.id} float32 1,048,576 31.5 G 25 % 62.9 G 50 %"
     assert " ".join(lines[4].split()) == found
     (tmp_path / "docs").mkdir()
@@ -337,9 +353,10 @@ def test_its_results_can_be_read(tmp_path):
     assert json.loads((tmp_path / "docs" / "gpu.json").read_text()) == report
     text = page.read_text()
     assert "float32, 4 at once" in text and text.startswith("above") and text.endswith("below")
-    assert f"| {BAR.id} | 120 k | 240 k | 31.5 G | 25 % | 10.5 G | 25 % |" in text
+    assert f"| {BAR.id} | 120 k | 240 k | 62.9 G | 50 % | 21.0 G | 50 % |" in text
+    assert "1.0 (JAX 0.11)" in text and f"| {BAR.id} | 1,048,576 | 62.9 G | 30.0 G | 2.1 |" in text
     rows[0] = {"id": BAR.id, "precision": "float32", "num_envs": 4, "problem": "failed"}
-    assert f"| {BAR.id} | failed |  | 31.5 G | 25 % |" in gpu.gpu_markdown(report)
+    assert f"| {BAR.id} | failed |  | 62.9 G | 50 % |" in gpu.gpu_markdown(report)
 
 
 def _on_any(task, num_envs, device, dtype, **options):

@@ -4,11 +4,13 @@ The rate is that of whole steps as in training: control, motion, reward, observa
 restarts, with random actions, at all times of the episodes. It is measured in two ways, in turn: calling
 `step`, and replaying a CUDA graph of it, which leaves out Python's share. For both, the result includes the
 data that a step has to read and write, as a share of the memory bandwidth. The bandwidth is measured by
-copying in the same run.
+copying in the same run. If gymnax and a JAX for the GPU are installed, gymnax's environment of the same task
+is measured in turn with ours, its steps compiled into one call.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -17,6 +19,8 @@ from typing import Any
 
 import torch
 
+from lag_envs import TASKS
+from lag_envs.benchmark import peers
 from lag_envs.device import DeviceEnvs
 from lag_envs.errors import one_line
 from lag_envs.progress import progress
@@ -29,6 +33,9 @@ FLAGS = 4 + 4 + 4
 FEW, LONGEST = 4096, 1000
 #: Number of batches of random actions, used in turn while time is measured.
 BATCHES = 16
+#: Steps in one call of gymnax, and how many of them are unrolled, up to a number of environments: the fastest
+#: of three forms on an H100.
+GYMNAX = {2**16: (64, 4), 2**62: (16, 1)}
 
 Run = Callable[[], Any]
 
@@ -81,13 +88,16 @@ def measured(
             try:
                 envs = _under_way(env_id, size, device, dtype)
                 run = _stepping(envs)
-                rates = _rates([run, _in_graph(run, device)], device, seconds, rounds)
+                runs = {"steps": (run, BATCHES), "replayed": (_in_graph(run, device), BATCHES)}
+                runs |= _peer(env_id, size, device, dtype)
+                rates = _rates([run for run, _ in runs.values()], device, seconds, rounds)
             except KeyboardInterrupt:
                 return report
             except Exception as error:
                 row["problem"] = f"failed: {one_line(error)}"
             else:
-                row["steps"], row["replayed"] = (BATCHES * size * rate for rate in rates)
+                for (name, (_, steps)), rate in zip(runs.items(), rates, strict=True):
+                    row[name] = size * steps * rate
                 per_step = traffic(envs) / report["bandwidth"]
                 row["share"], row["replayed_share"] = row["steps"] * per_step, row["replayed"] * per_step
             report["rows"].append(row)
@@ -161,6 +171,29 @@ def _in_graph(run: Run, device: torch.device) -> Run:
     with torch.cuda.device(device), torch.cuda.graph(graph):
         run()
     return graph.replay
+
+
+def _peer(env_id: str, size: int, device: torch.device, dtype: torch.dtype) -> dict[str, tuple[Run, int]]:
+    """Return steps of gymnax's environment of the same task, and how many a call takes, if it can run."""
+    name = TASKS[env_id].peer if env_id in TASKS else ""
+    if not name or dtype != torch.float32 or device.type != "cuda":
+        return {}
+    together, unroll = next(form for most, form in GYMNAX.items() if size <= most)
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # PyTorch needs memory too
+    try:
+        import jax
+
+        there = jax.default_device(jax.devices("cuda")[device.index])
+        with there:
+            step = peers.gymnax(size, name, together, unroll)
+    except (ImportError, RuntimeError):  # not installed, or not for this GPU
+        return {}
+
+    def run() -> None:
+        with there:
+            step(together)
+
+    return {"gymnax": (run, together)}
 
 
 def _rates(runs: Sequence[Run], device: torch.device, seconds: float, rounds: int) -> list[float]:

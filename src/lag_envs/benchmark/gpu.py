@@ -9,6 +9,10 @@ from lag_envs.generated import replaced
 from lag_envs.store import readable_json, write_file
 from lag_envs.tables import aligned, markdown_table, rate_text
 
+GYMNAX = "https://github.com/RobertTLange/gymnax"
+#: The head of the table that compares with gymnax.
+PEER = ("id", "at once", "in a CUDA graph", "gymnax", "ratio")
+
 
 def console_lines(report: dict[str, Any]) -> list[str]:
     """Return the report as lines of text."""
@@ -23,6 +27,8 @@ def console_lines(report: dict[str, Any]) -> list[str]:
     )
     rows = [(row["id"], row["precision"], f"{row['num_envs']:,}", *_cells(row)) for row in report["rows"]]
     lines = [_about(report), "", *aligned([head, *rows])]
+    if compared := _compared(report):
+        lines += ["", *aligned([PEER, *compared])]
     return lines if report["complete"] else [*lines, "", "interrupted: these are the results so far"]
 
 
@@ -34,19 +40,26 @@ def gpu_markdown(report: dict[str, Any]) -> str:
     def cells(id: str) -> list[str]:
         cases = ("float32", few), ("float32", many), ("float64", many)
         small, single, double = (_cells(rows[id, *case]) for case in cases)
-        return [id, *small[::2], *single[:2], *double[:2]]
+        return [id, *small[::2], *single[2:], *double[2:]]
 
     head = (
         "id",
-        f"float32, {few:,} at once",
+        f"float32, {few:,} at once, called",
         "in a CUDA graph",
-        f"float32, {many:,} at once",
+        f"float32, {many:,} at once, in a CUDA graph",
         "of bandwidth",
-        f"float64, {many:,} at once",
+        f"float64, {many:,} at once, in a CUDA graph",
         "of bandwidth",
     )
     ids = dict.fromkeys(row["id"] for row in report["rows"])
-    return f"Steps per second. {_about(report)}.\n\n{markdown_table(head, map(cells, ids))}"
+    text = f"Steps per second. {_about(report)}.\n\n{markdown_table(head, map(cells, ids))}"
+    if compared := _compared(report):
+        gymnax, jax = (report["versions"][name] for name in ("gymnax", "jax"))
+        text += (
+            f"\n\nThe environments of [gymnax]({GYMNAX}) {gymnax} (JAX {jax}) with the same tasks, in the "
+            f"same run, in float32:\n\n{markdown_table(PEER, compared)}"
+        )
+    return text
 
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
@@ -60,6 +73,21 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
 def with_table(page: str, report: dict[str, Any]) -> str:
     """Return the text of docs/speed.md with a report's table."""
     return replaced(page, "gpu", gpu_markdown(report))
+
+
+def _compared(report: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return the lines of `PEER`: steps in a CUDA graph beside those of gymnax."""
+    return [
+        (
+            row["id"],
+            f"{row['num_envs']:,}",
+            rate_text(row["replayed"]),
+            rate_text(row["gymnax"]),
+            f"{row['replayed'] / row['gymnax']:.2g}",
+        )
+        for row in report["rows"]
+        if "gymnax" in row
+    ]
 
 
 def _cells(row: dict[str, Any]) -> list[str]:

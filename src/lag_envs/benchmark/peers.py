@@ -32,13 +32,15 @@ def envpool(n: int) -> Run:
     return batch(envs.step, random_actions(n, 2.0))
 
 
-def gymnax(n: int, together: int = 8) -> Run:
-    """Prepare gymnax, several steps in one compiled call, as intended by its authors."""
+def gymnax(n: int, env_id: str = "Pendulum-v1", together: int = 8, unroll: int = 1) -> Run:
+    """Prepare an environment of gymnax, several steps in one compiled call, as intended by its authors."""
     jax = import_module("jax")
-    env, params = import_module("gymnax").make("Pendulum-v1")
+    env, params = import_module("gymnax").make(env_id)
     reset = jax.vmap(env.reset, in_axes=(0, None))
     step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
-    actions = jax.numpy.asarray(np.stack(random_actions(n, 2.0)[:together])[:, :, 0])
+    key = jax.random.PRNGKey(0)
+    sample = jax.vmap(jax.vmap(env.action_space(params).sample))
+    actions = sample(jax.random.split(key, (together, n)))
 
     def one(state: Any, inputs: tuple) -> tuple:
         key, action = inputs
@@ -48,9 +50,9 @@ def gymnax(n: int, together: int = 8) -> Run:
     @jax.jit
     def several(key: Any, state: Any) -> tuple:
         key, now = jax.random.split(key)
-        return key, *jax.lax.scan(one, state, (jax.random.split(now, together), actions))
+        keys = jax.random.split(now, together)
+        return key, *jax.lax.scan(one, state, (keys, actions), unroll=unroll)
 
-    key = jax.random.PRNGKey(0)
     _, state = jax.jit(reset)(jax.random.split(key, n), params)
 
     def run(steps: int) -> int:

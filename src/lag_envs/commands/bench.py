@@ -172,7 +172,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     about = {
         "date": args.date,
         "machine": machine(),
-        "versions": {"lag_envs": __version__} | installed_versions(["torch"]),
+        "versions": {"lag_envs": __version__} | installed_versions(["torch", "gymnax", "jax"]),
     }
     report = about | measured(
         perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.05, args.rounds or 9

@@ -45,7 +45,14 @@ OPERATIONS: Mapping[str, tuple[str, str, str]] = {
     "read": ("{}[{}]", "{}[{}]", "{}[{}]"),
 }
 
-#: Statements in all languages.
+_FOR = (
+    "for {0} in range({1}, {2}, {3}):",
+    "for (let {0} = {1}; {0} < {2}; {0} += {3}) {{",
+    "for (int {0} = {1}; {0} < {2}; {0} += {3}) {{",
+)
+
+#: Statements in all languages. A "repeat" may be left before its end. A "for" is short, and a GPU's compiler
+#: is asked to unroll it.
 STATEMENTS: Mapping[str, tuple[str, str, str]] = {
     "let": ("{} = {}", "const {} = {};", "const auto {} = {};"),
     "array": ("{} = [0.0] * {}", "const {} = new Float64Array({});", "real {}[{}];"),
@@ -53,11 +60,8 @@ STATEMENTS: Mapping[str, tuple[str, str, str]] = {
     "set": ("{} = {}", "{} = {};", "{} = {};"),
     "write": ("{}[{}] = {}", "{}[{}] = {};", "{}[{}] = {};"),
     "if": ("if {}:", "if ({}) {{", "if ({}) {{"),
-    "for": (
-        "for {0} in range({1}, {2}, {3}):",
-        "for (let {0} = {1}; {0} < {2}; {0} += {3}) {{",
-        "for (int {0} = {1}; {0} < {2}; {0} += {3}) {{",
-    ),
+    "for": (*_FOR[:2], f"UNROLL {_FOR[2]}"),
+    "repeat": _FOR,
     "leave": ("if not {}: break", "if (!{}) break;", "if (!{}) break;"),
     "function": ("def {}({}):", "function {}({}) {{", "INLINE auto {}({}) {{"),
     "return": ("return {}", "return {};", "return {};"),
@@ -131,7 +135,7 @@ function copysign(x, sign) {{
 }}
 """,
 )
-#: C++ for processors and GPUs; INLINE, INF and UNDEFINED are defined by the surrounding code.
+#: C++ for processors and GPUs; INLINE, INF, UNDEFINED and UNROLL are defined by the surrounding code.
 CPP = Language(
     2,
     {"True": "true", "False": "false", "inf": "INF", "-inf": "(-INF)", "nan": "UNDEFINED"},
@@ -230,7 +234,9 @@ class Script:
         self._block: list[Statement] = []
         self._functions: list[Statement] = []
         self._elementary: dict[str, Statement] = {}
-        self._count = self._memory = 0
+        self._count = 0
+        #: Size of the array that holds the coefficients of series.
+        self.memory = 0
 
     # --- text ----------------------------------------------------------------------------------------------
 
@@ -243,7 +249,7 @@ class Script:
                 parts, numbers = _cut(function, language.largest)
                 functions += parts
                 spilled = max(spilled, numbers)
-        arrays = [Statement("array", (name, n)) for name, n in (("m", self._memory), ("s", spilled)) if n]
+        arrays = [Statement("array", (name, n)) for name, n in (("m", self.memory), ("s", spilled)) if n]
         if language.own_memory:
             functions = [_with_memory(function, arrays) for function in functions]
             arrays = []
@@ -376,7 +382,7 @@ class Script:
         return f"{a} < {b}"
 
     def _at(self, slot: int, k: Any) -> Any:
-        self._memory = max(self._memory, (slot + 1) * STRIDE)
+        self.memory = max(self.memory, (slot + 1) * STRIDE)
         return slot * STRIDE + k if isinstance(k, int) else f"{slot * STRIDE} + {k}"
 
     def load(self, slot: int, k: Any) -> str:
@@ -402,7 +408,7 @@ class Script:
             self._change(names, values)
             self.say("leave", going)
 
-        self.say("for", k, 0, times, 1, body=self._inside(inside))
+        self.say("repeat", k, 0, times, 1, body=self._inside(inside))
         return names
 
     def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list:
@@ -595,7 +601,7 @@ def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Sta
             if kind in ("let", "vary", "set") and parts[0] in known:
                 at = known[parts[0]][2:-1]
                 yield Statement("write", ("s", at, put(parts[1], known)))
-            elif kind == "for" and parts[0] in known:
+            elif kind in ("for", "repeat") and parts[0] in known:
                 k, inside = parts[0], {v: place for v, place in known.items() if v != parts[0]}
                 keep = Statement("write", ("s", known[k][2:-1], k))
                 ends = tuple(put(part, known) for part in parts[1:])
