@@ -67,7 +67,7 @@ lint: setup
 types: setup
 	$(BIN)/python -m mypy
 
-audit: setup  ## check that all on the leaderboard is what was noted when it came there
+audit: setup  ## check that nothing on the leaderboard has changed since it was added
 	$(BIN)/lag-envs leaderboard audit --pin src/lag_envs/leaderboard/pin.json $(ARGS)
 
 check: lint types test audit  ## all that CI runs: lint, types, tests, doctests, the board's audit
@@ -75,7 +75,7 @@ check: lint types test audit  ## all that CI runs: lint, types, tests, doctests,
 bench: setup  ## compare the speed with other environments
 	$(BIN)/lag-envs bench $(ARGS)
 
-bench-docs: setup  ## the same, taken over into docs and README; on a machine with nothing else to do
+bench-docs: setup  ## the same, written into docs and README; needs an otherwise idle machine
 	$(BIN)/lag-envs bench --checkout . $(ARGS)
 
 report: setup  ## measure errors and write a page about them, into the folder report; ARGS='--docs .' into docs too

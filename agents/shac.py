@@ -74,7 +74,7 @@ class Settings(LearnerSettings):
     critic_rate: float = Field(ge=0, description="learning rate of the critic")
     critic_epochs: int = Field(ge=1, description="passes over a window, in each of which the critic learns")
     batch_size: int = Field(ge=1, description="steps of a minibatch of the critic")
-    td_lambda: float = Field(ge=0, le=1, description="decay of later steps' weights in its targets")
+    td_lambda: float = Field(ge=0, le=1, description="weight of later steps in the critic's targets (lambda)")
 
     @model_validator(mode="after")
     def _fit(self) -> Self:

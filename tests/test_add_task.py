@@ -126,13 +126,16 @@ def test_commands(task, file, capsys):
 
 
 def test_docs_page(task):
-    """Its page, though it has neither prose nor results yet."""
+    """Its page, though it has no results yet."""
     page = environments.environment_page(ID)
     headings = re.findall("^## (.+)$", page, re.MULTILINE)
     assert headings == [name for name in environments.HEADINGS if name in headings]
     assert {"Action Space", "Observation Space", "Arguments", "Equations"} <= set(headings)
     assert "| 1 | `elbow` |  | N m | -2 | 2 |" in page and '"target": [goal_1, goal_2]' in page
-    assert "| 0 | `theta_1` |  | rad | -∞ | ∞ |" in page and page.count('class="equation"') == 3
+    assert (
+        "| 0 | `theta_1` | angle of the upper arm | rad | -∞ | ∞ |" in page
+        and page.count('class="equation"') == 3
+    )
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_readme_links_to_pages_that_a_package_index_reaches():
 
 
 def test_classifiers_are_known_and_tested():
-    """Each Python is one that `make setup` accepts, each system one that the workflow runs the tests on."""
+    """`make setup` accepts each Python, and the workflow runs the tests on each of them and each system."""
     assert set(PROJECT["classifiers"]) <= classifiers
     setup = (ROOT / "tools" / "setup").read_text(encoding="utf-8")
     oldest, newest = (
@@ -57,11 +57,12 @@ def test_classifiers_are_known_and_tested():
     assert [int(minor) for minor in stated] == list(range(oldest, newest + 1))
     assert PROJECT["requires-python"] == f">=3.{oldest}"
     systems = {"ubuntu": "Linux", "macos": "MacOS", "windows": "Windows"}
-    matrix = load(".github/workflows/tests.yml")["jobs"]["tests"]["strategy"]["matrix"]["os"]
+    matrix = load(".github/workflows/tests.yml")["jobs"]["tests"]["strategy"]["matrix"]
+    assert matrix["python"] == [f"3.{minor}" for minor in stated]
     known = {
         name for c in PROJECT["classifiers"] if "Operating System" in c for name in [c.split(" :: ")[-1]]
     }
-    assert known == {systems[runner.split("-")[0]] for runner in matrix}
+    assert known == {systems[runner.split("-")[0]] for runner in matrix["os"]}
 
 
 def test_a_release_is_published_only_when_switched_on():

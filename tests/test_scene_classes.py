@@ -223,7 +223,9 @@ def test_a_yes_or_no_is_a_bool():
 @pytest.mark.parametrize("value", [50.0, parameter(50.0, "kg")])
 def test_a_parameter_in_a_class_that_is_no_scene_is_named(value):
     mixin = type("Heavy", (), {"mass": value})
-    with pytest.raises(FormulaError, match=r"Mixed.mass: Heavy is no scene, so this has no effect; declare"):
+    with pytest.raises(
+        FormulaError, match=r"Mixed.mass: Heavy is not a scene, so this has no effect; declare"
+    ):
         type("Mixed", (mixin, PivotedBar), {})()
 
 

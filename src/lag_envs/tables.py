@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align the rows' cells; columns of numbers, apart from their heads, are aligned to the right.
+    """Align the rows' cells; columns of numbers, with or without a unit, are aligned to the right.
 
     Examples
     --------
@@ -23,7 +23,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     for j in range(max(map(len, rows), default=0)):
         cells = [row[j] if j < len(row) else "" for row in rows]
         width = max(map(columns, cells))
-        right = all(re.fullmatch(r"(-?[\d.,]+( [kMG])?|-?)", cell) for cell in cells[1:])
+        right = all(re.fullmatch(r"(-?[\d.,]+( ?[kMGs%])?|-?)", cell) for cell in cells[1:])
         for line, cell in zip(lines, cells, strict=True):
             blank = " " * (width - columns(cell))
             line.append(blank + cell if right else cell + blank)

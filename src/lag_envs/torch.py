@@ -402,7 +402,7 @@ class TorchVectorEnv:
         return None if mask is None or not len(self._state) else self.state
 
     def _keep(self, state: Tensor, before: Tensor | None = None, mask: Any = None) -> None:
-        """Store the present states with their history; outside a mask, keep that of the states before."""
+        """Store the current states and their history; outside a mask, keep the old history."""
         assert isinstance(self.envs, LagrangianVectorEnv)
         if before is not None:
             state = torch.where(torch.as_tensor(mask)[:, None], state, before)

@@ -22,7 +22,7 @@ def easier(
 ) -> tuple[Task, Callable[[Array], Array]]:
     """Return a task that is easier to plan for, and the final cost of a plan.
 
-    In this task a plan's end counts most, and its course only a little. The control is weaker, so that the
+    This task weighs a plan's end most and its course only a little. The control is weaker, so that the
     feedback has a reserve for correcting the plan.
 
     Parameters

@@ -488,7 +488,7 @@ def _change(state: BoardState, event: Verified | Rejected | Withdrawn) -> None:
     for old in event.supersedes:
         other = state.entries[old]
         if other.state != "verified" or not same_agent(other, known):
-            raise ValueError(f"{event.id} supersedes {old}, which is not the same authors' of the same name")
+            raise ValueError(f"{event.id} supersedes {old}, which has another name or other authors")
         state.entries[old] = replace(other, state="superseded", reason=f"by {event.id}")
 
 

@@ -31,6 +31,7 @@ from lag_envs.leaderboard.results import UNPACKED, checked_result, code_digest, 
 from lag_envs.leaderboard.submission import Refused, Submission, about, load, read_files
 from lag_envs.options import new_file
 from lag_envs.store import write_file
+from lag_envs.tables import aligned
 from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]
@@ -240,7 +241,7 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
         "--jobs", metavar="N", type=int, default=1, help="submissions to verify in parallel (default: 1)"
     )
     parser.add_argument(
-        "--ray", metavar="ADDRESS", help='spread the submissions over a Ray cluster; "local" starts one'
+        "--ray", metavar="ADDRESS", help='distribute the submissions over a Ray cluster; "local" starts one'
     )
     parser.add_argument("--json", type=new_file, metavar="FILE", help="write all results to this file")
     parser.add_argument(
@@ -370,21 +371,25 @@ def result_lines(result: dict[str, Any]) -> list[str]:
     if "refused" in result:
         return [f"{ascii_text(result['folder'])}: refused: {result['refused']}"]
     env, folder = result["env"], ascii_text(result["folder"])
-    lines = [
-        f"{folder}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
-        f"  {'seed':>6}  {'return':>12}  {'±':>7}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
-    ]
+    reference = protocol.reference(env)
+    rows = [("seed", "return", "±", "score", "success", "time", "effort")]
     for policy in result["policies"]:
-        reference = protocol.reference(env)
         mean = float(corrected(reference, [policy]).mean())
         error = policy_error(reference, [policy])
         times = [t for t in policy["settle"] if t is not None]
-        part, spread = score(env, mean), "-" if error is None else f"{error:.2g}"
-        lines.append(
-            f"  {policy['seed']:>6}  {mean:12.5g}  {spread:>7}  {'' if part is None else f'{part:.4f}':>7}"
-            f"  {np.mean(policy['success']):7.1%}  {f'{np.median(times):.2f} s' if times else '-':>7}"
-            f"  {np.mean(policy['effort']):6.3f}"
+        part = score(env, mean)
+        row = (
+            str(policy["seed"]),
+            f"{mean:.5g}",
+            "-" if error is None else f"{error:.2g}",
+            "" if part is None else f"{part:.4f}",
+            f"{np.mean(policy['success']):.1%}",
+            f"{np.median(times):.2f} s" if times else "-",
+            f"{np.mean(policy['effort']):.3f}",
         )
+        rows.append(row)
+    lines = [f"{folder}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s"]
+    lines += ["  " + line for line in aligned(rows)]
     worst = min(result["robustness"], key=lambda name: np.mean(result["robustness"][name]))
     lines.append(f"  worst disturbance: {worst}, mean return {np.mean(result['robustness'][worst]):.5g}")
     if None not in result["often"]:

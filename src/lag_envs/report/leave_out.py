@@ -214,7 +214,7 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
 
 
 def _listed(name: str) -> Callable[[Row], str]:
-    """Return a function that shows a row's entry of this name, a list."""
+    """Return a function that formats a row's entry of this name, a list."""
     return lambda row: ", ".join(row[name]) or "none"
 
 

@@ -5,8 +5,7 @@ Of the package it uses only the scene's energies, its names and their form in Sy
 and `stepping`; numbers are python-flint's balls. There are two methods:
 
 * Taylor series, with one more coefficient by each Picard iteration on series of balls. The last coefficients
-decide
-  the step's length. Balls enclose the effects of rounding and cancellation within a step.
+  decide the step's length. Balls enclose the effects of rounding and cancellation within a step.
 * Where damping is so heavy that such steps would be far shorter than the time that is left, and once its
   boundary layer has died out: collocation at Chebyshev nodes that include the end of the step, which is
   stable for any damping, by Newton's method.

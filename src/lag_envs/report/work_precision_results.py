@@ -141,8 +141,8 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "torchdiffeq a batch is one tensor. MuJoCo runs in its compiled rollouts without contacts and "
         "constraints. SciPy's Radau and MuJoCo have no batch, so they take one state after the other. "
         "Anything that would take more than a few seconds is not run.",
-        "Times are those of one control step. Everything in a job is timed in turn with lag_envs, and the "
-        "median is taken. The times of different jobs are made comparable by the time of lag_envs in each "
+        "Times are those of one control step. Each method is timed in turn with lag_envs; medians are given. "
+        "The times of different jobs are made comparable by the time of lag_envs in each "
         "job. Over 10 s or 1,000 s, slow methods are timed over only a part of that time, also in one "
         "call.",
     ]

@@ -99,7 +99,7 @@ def check_class(cls: type, base: type) -> None:
             for name, value in vars(c).items():
                 if isinstance(value, dataclasses.Field) or name in getattr(cls, "__dataclass_fields__", ()):
                     raise FormulaError(
-                        f"{of}.{name}: {c.__name__} is no scene, so this has no effect; declare it in {of}"
+                        f"{of}.{name}: {c.__name__} is not a scene, so this has no effect; declare it in {of}"
                     )
     faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
     if faults:

@@ -36,8 +36,8 @@ from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, KNOWN, Node, SeriesRe
 from lag_envs.stepping.matrices import Inverse, matrix_times
 from lag_envs.stepping.target import Target
 
-#: The orders that a series may have.
-SMALLEST_ORDER, LARGEST_ORDER = 4, 24
+#: The largest order of a series.
+LARGEST_ORDER = 24
 
 #: Largest truncation error of a substep, relative to the size of the velocities.
 TOLERANCE = 1e-14

@@ -175,6 +175,6 @@ class RotarySwingUp(Task):
         return {"upright": outlines(self.scene.bodies()["pendulum"]), **super().bodies()}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Add where the upright pendulum is."""
+        """Add a mark where the upright pendulum is."""
         x, y, _ = self.scene.poses(now.q, xp)["pendulum"]
         return {**super().indicators(now, xp), "upright": (x, y, math.pi)}

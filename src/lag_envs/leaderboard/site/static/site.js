@@ -1298,7 +1298,7 @@
 
   // --- start -----------------------------------------------------------------------------------------------
 
-  // An old browser shows the page as it is without a script.
+  // Old browsers show the page as it is without scripts.
   if (!Element.prototype.replaceChildren) {
     const said = find("#drive .status");
     if (said) said.textContent = TOO_OLD;
