@@ -323,8 +323,8 @@ def _method(data: Data) -> str:
             f" seeds start at {data['first_seed']:,}, are never used in training and tuning, and are the same"
             " for all agents. Agents act deterministically.",
             "- *Settings*: those of fast PPO were chosen by trainings with seeds 0 and 1, which are"
-            " among the reported seeds. Its scores may be slightly optimistic, although the choice was made by"
-            " other episodes. Searches by `python -m agents.tune` now train with other seeds.",
+            " among the reported seeds. Its scores may be slightly optimistic, although the choice was made"
+            " by other episodes. Searches by `python -m agents.tune` now train with other seeds.",
             *_fewer(data),
             "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their length in"
             " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if any, are"

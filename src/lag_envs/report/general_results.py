@@ -125,7 +125,8 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "mode, its compiled step in a compiled loop, in a batch in blocks of two widths. MuJoCo runs its "
             "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
             "algorithm in RK4 steps in a C++ loop. For both, a moving support is modelled by an inertial "
-            "force in its own frame. RK4, DOP853 and Radau IIA take fixed steps and are compiled like lag_envs.",
+            "force in its own frame. RK4, DOP853 and Radau IIA take fixed steps and are compiled like "
+            "lag_envs.",
             *([f"Not compared: {absent}."] if absent else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
