@@ -100,7 +100,7 @@ def board_candidates(board: Any) -> list[Candidate]:
 
 
 def chosen_candidates(of: Iterable[Candidate], most: int = MOST) -> dict[str, Candidate]:
-    """Return the best for each environment; if they are too large together, replace some where that costs least.
+    """Return the best for each environment; if they are too large together, replace where that costs least.
 
     Examples
     --------
