@@ -68,7 +68,7 @@ types: setup
 	$(BIN)/python -m mypy
 
 audit: setup  ## check that nothing on the leaderboard has changed since it was added
-	$(BIN)/lag-envs leaderboard audit --pin src/lag_envs/leaderboard/pin.json $(ARGS)
+	$(BIN)/lag-envs leaderboard audit --pin src/lag_envs/leaderboard/pin.json --jobs 2 $(ARGS)
 
 check: lint types test audit  ## all that CI runs: lint, types, tests, doctests, the board's audit
 

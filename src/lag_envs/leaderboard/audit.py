@@ -49,9 +49,11 @@ from lag_envs.leaderboard.log import (
     parse,
     read_log,
 )
+from lag_envs.leaderboard.parallel import shared
 from lag_envs.leaderboard.pending import Neighbours, claimed, shown_episodes
 from lag_envs.leaderboard.results import apart, code_digest, compare_results
 from lag_envs.store import write_file
+from lag_envs.workers import died
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About, Submission
@@ -453,6 +455,7 @@ def audit(
     everything: bool = False,
     tell: Callable[[Finding], Any] = lambda finding: None,
     progress: Callable[[BoardEntry], Any] = lambda entry: None,
+    jobs: int = 1,
 ) -> bool:
     """Run all checks; return True if nothing is wrong.
 
@@ -468,14 +471,17 @@ def audit(
     tell : callable
         Called with each finding.
     progress : callable
-        Called with each entry before its result is checked.
+        Called with each entry when its result is checked.
+    jobs : int
+        Number of processes that play the sampled episodes.
     """
     found = cheap(board, pin)
     findings = list(found.findings)
     for finding in findings:
         tell(finding)
     if not found.findings[0].wrong:
-        scores = partial(_all if everything else _sample, board, found, progress)
+        given = board, found, progress
+        scores = partial(_all, *given) if everything else partial(_sample, *given, jobs)
         for check in (partial(_nonces, board, found), scores):
             finding = check()
             findings.append(finding)
@@ -508,49 +514,63 @@ def _playable(
             yield entry, submission, result, scale.best - scale.random, where
 
 
-def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
+def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any], jobs: int) -> Finding:
     """Play the recorded episodes of each policy again, and some more that cannot be foreseen."""
+    finding, played, wrong = Finding("scores"), 0, {}
+    work = [
+        ((entry, where), (board.submission(entry.id), result, way))
+        for entry, _, result, way, where in _playable(board, found, lambda entry: None)
+    ]
+    for (entry, where), outcome in shared(work, _played_again, jobs):
+        progress(entry)
+        if isinstance(outcome, BaseException):
+            outcome = 0, [f"policies that cannot be played: {died(outcome)}"]
+        played += outcome[0]
+        wrong[where] = [f"{where} has {ascii_text(what)}; verify {entry.id} again" for what in outcome[1]]
+    finding.wrong += [text for (_, where), _ in work for text in wrong[where]]
+    finding.told = f"{played} episodes of {len(work)} results were played again"
+    return finding
+
+
+def _played_again(folder: Path, result: dict[str, Any], way: float) -> tuple[int, list[str]]:
+    """Play some episodes of a submission again; return how many, and in what they differ from its result."""
     from lag_envs.evaluation.rollout import PolicyError
-    from lag_envs.leaderboard.submission import Refused
+    from lag_envs.leaderboard.submission import Refused, load
     from lag_envs.leaderboard.verify import record_again
 
-    finding, draw, played, results = Finding("scores"), random.SystemRandom(), 0, 0
-    for entry, submission, result, way, where in _playable(board, found, progress):
-        middle, recorded = shown_episodes(result)
-        odd: list[str] = []
-        # On another build, one of these few episodes may be a different one altogether.
-        tolerated = int(result.get("build") != code_digest())
-        plans = submission.architecture.plans
-        for number, policy in enumerate(result["policies"]):
-            chosen = draw.sample(range(result["episodes"]), min(SAMPLE, result["episodes"]))
-            if number == middle:
-                chosen += [i for i in recorded.values() if i not in chosen]
-            try:
-                again, episodes = record_again(submission, dict(result), number, chosen)
-            except (PolicyError, Refused) as error:
-                odd.append(f"a policy that cannot be played: {error}")
-                continue
-            played += len(chosen)
-            kept = {
-                name: [values[i] for i in chosen] if isinstance(values, list) else values
-                for name, values in policy.items()
-            }
+    submission, draw, played = load(folder), random.SystemRandom(), 0
+    middle, recorded = shown_episodes(result)
+    odd: list[str] = []
+    # On another build, one of these few episodes may be a different one altogether.
+    tolerated = int(result.get("build") != code_digest())
+    plans = submission.architecture.plans
+    for number, policy in enumerate(result["policies"]):
+        chosen = draw.sample(range(result["episodes"]), min(SAMPLE, result["episodes"]))
+        if number == middle:
+            chosen += [i for i in recorded.values() if i not in chosen]
+        try:
+            again, episodes = record_again(submission, dict(result), number, chosen)
+        except (PolicyError, Refused) as error:
+            odd.append(f"a policy that cannot be played: {error}")
+            continue
+        played += len(chosen)
+        kept = {
+            name: [values[i] for i in chosen] if isinstance(values, list) else values
+            for name, values in policy.items()
+        }
+        odd += [
+            f"other {name} than episodes {chosen} of seed {policy['seed']} have"
+            for name, share in apart(kept, again, way, plans).items()
+            if round(share * len(chosen)) > tolerated
+        ]
+        if number == middle and result.get("build") is not None and not plans:
+            made = {episode["reset_seed"]: episode for episode in episodes}
             odd += [
-                f"other {name} than episodes {chosen} of seed {policy['seed']} have"
-                for name, share in apart(kept, again, way, plans).items()
-                if round(share * len(chosen)) > tolerated
-            ]
-            if number == middle and result.get("build") is not None and not plans:
-                made = {episode["reset_seed"]: episode for episode in episodes}
-                odd += [
-                    f"another recorded episode ({told['label']}) than is played"
-                    for told in result["replays"]
-                    if not _same_episode(told, made[told["reset_seed"]])
-                ][tolerated:]
-        results += 1
-        finding.wrong += [f"{where} has {ascii_text(what)}; verify {entry.id} again" for what in odd]
-    finding.told = f"{played} episodes of {results} results were played again"
-    return finding
+                f"another recorded episode ({told['label']}) than is played"
+                for told in result["replays"]
+                if not _same_episode(told, made[told["reset_seed"]])
+            ][tolerated:]
+    return played, odd
 
 
 def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:

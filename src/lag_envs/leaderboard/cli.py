@@ -121,6 +121,10 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "--all", action="store_true", help="verify every result again, instead of a few episodes (minutes)"
     )
     one.add_argument(
+        "--jobs", metavar="N", type=count, default=1,
+        help="processes that play the few episodes (default: 1)",
+    )  # fmt: skip
+    one.add_argument(
         "--pin", metavar="FILE", type=Path, help="pin to check the log against (default: the release's)"
     )
     one = action("pin", "write the log's head into a file that ships with a release", _pin)
@@ -407,7 +411,7 @@ def _audit(args: argparse.Namespace) -> int:
                 for text in finding.wrong:
                     print(f"  {_plain(text)}", flush=True)
 
-        fine = audit(board, args.pin, args.all, tell, lambda entry: bar.update())
+        fine = audit(board, args.pin, args.all, tell, lambda entry: bar.update(), args.jobs)
     return 0 if fine else 1
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lag_envs.leaderboard.fields import ascii_text
 from lag_envs.workers import as_they_finish, cluster, processes
 
 Work = Callable[[Path], Any]
+Key = TypeVar("Key")
 
 
 def map_submissions(
@@ -55,12 +56,28 @@ def map_submissions(
                 else:
                     futures[submit(_unpacked, function, folder.name, files)] = folder
             yield from as_they_finish(futures)
-    elif jobs > 1 and len(folders) > 1:
-        with processes(min(jobs, len(folders))) as submit:
-            yield from as_they_finish({submit(function, folder): folder for folder in folders})
     else:
-        for folder in folders:
-            yield folder, _caught(function, folder)
+        yield from shared([(folder, (folder,)) for folder in folders], function, jobs)
+
+
+def shared(
+    work: Sequence[tuple[Key, tuple]], function: Callable[..., Any], jobs: int = 1
+) -> Iterator[tuple[Key, Any]]:
+    """Share calls of a function among processes; yield (key, what it returned or raised) as each finishes.
+
+    Parameters
+    ----------
+    work : sequence of (key, arguments)
+        The calls.
+    function, jobs
+        As for `map_submissions`.
+    """
+    if jobs > 1 and len(work) > 1:
+        with processes(min(jobs, len(work))) as submit:
+            yield from as_they_finish({submit(function, *arguments): key for key, arguments in work})
+    else:
+        for key, arguments in work:
+            yield key, _caught(function, *arguments)
 
 
 def with_bar(function: Callable[..., Any], folder: Path) -> Any:
@@ -78,9 +95,9 @@ def with_bar(function: Callable[..., Any], folder: Path) -> Any:
         return function(folder, progress=show)
 
 
-def _caught(function: Work, folder: Path) -> Any:
+def _caught(function: Callable[..., Any], *arguments: Any) -> Any:
     try:
-        return function(folder)
+        return function(*arguments)
     except Exception as error:
         return error
 
