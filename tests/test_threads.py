@@ -83,7 +83,7 @@ def test_a_bad_action_steps_nothing():
 
 @pytest.mark.slow
 def test_refused_environments_do_not_stop_the_others():
-    """The named environment is the last, as with one thread."""
+    """The named environment is the first, as with one thread, and all are marked."""
     stuck = [BLOCK + 3, 4 * BLOCK, 5 * BLOCK + 1]
     lengths = np.full(MANY, 0.3)
     lengths[stuck] = 1e-30
@@ -93,8 +93,11 @@ def test_refused_environments_do_not_stop_the_others():
         envs = made(threads, **options)
         envs.reset(seed=1)
         for action in actions(3, MANY, 1):
-            with pytest.raises(StepRefused, match=f"environment {stuck[-1]} was refused") as error:
+            with pytest.raises(
+                StepRefused, match=f"environment {stuck[0]} .like those of {stuck[1]}, {stuck[2]};"
+            ) as error:
                 envs.step(action)
+            assert np.flatnonzero(error.value.results[-1]["refused"]).tolist() == stuck
             seen.append([envs.state, *error.value.results[:4]])
     for alone, together in zip(seen[:3], seen[3:], strict=True):
         assert [a.tobytes() for a in alone] == [b.tobytes() for b in together]

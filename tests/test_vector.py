@@ -577,8 +577,18 @@ def test_a_refusal_carries_what_the_others_did():
     envs.reset(seed=1)
     with pytest.raises(StepRefused) as error:
         envs.step(np.zeros((2, 1), np.float32))
-    observations, rewards, *_ = error.value.results
-    assert observations.shape == (2, 3) and np.isfinite(rewards[0])
+    observations, rewards, terminated, truncated, infos = error.value.results
+    assert observations.shape == (2, 3) and rewards[0] > 0.0 and rewards[1] == 0.0
+    assert infos["refused"].tolist() == [False, True] and not (terminated | truncated).any()
+    # All are named, and marked; those that are reset go on.
+    lengths["com_distance"] = [1e-30, 0.3, 1e-30, 1e-30]
+    envs = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=4, **lengths, **ANY_BAR)
+    envs.reset(seed=1)
+    with pytest.raises(
+        StepRefused, match=r"environment 0 .like those of 2, 3; results.*was refused"
+    ) as error:
+        envs.step(np.zeros((4, 1), np.float32))
+    assert error.value.results[-1]["refused"].tolist() == [True, False, True, True]
 
 
 def test_it_tells_limits_and_which_episodes_are_over():

@@ -279,7 +279,8 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
             Before the first reset; with autoreset disabled also if an episode is over.
         StepRefused
             If an environment's step cannot be taken to full accuracy. That environment keeps its state; all
-            others have been stepped.
+            others have been stepped. The error's ``results`` are what would have been returned; in their
+            infos, ``"refused"`` marks all such environments.
         """
         actions = self._actions.many(actions, self.num_envs)
         if not self._started:
@@ -314,13 +315,16 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         self._over = over
         observations = observations.T
         infos = self._infos(None)
+        if status > 0:
+            infos["refused"] = np.isnan(rewards)
+            rewards[infos["refused"]] = 0.0
         if self._over and self.autoreset_mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
         if self._seen:
             self._count(rewards)
         results = observations, rewards, terminations, truncations, infos
         if status > 0:
-            raise self._refusal(status - 1, results)
+            raise self._refusal(results)
         return results
 
     def render(self) -> Any:
@@ -597,8 +601,12 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
             infos = self._add_info(infos, diagnostics(task.scene, states[i], controls[i]), int(i))
         return infos
 
-    def _refusal(self, i: int, results: tuple) -> StepRefused:
+    def _refusal(self, results: tuple) -> StepRefused:
+        i, *others = np.flatnonzero(results[-1]["refused"]).tolist()
         where = f"the step of environment {i}"
+        if others:
+            few = ", ".join(map(str, others[:10])) + (", ..." if len(others) > 10 else "")
+            where += f" (like those of {few}; results[-1]['refused'] of this error marks all)"
         control = self._controls(self._program.asked or self._program.u)[i]
         error = self.tasks[i].formulas.refusal(self.state[i], control, self.task.dt, where)
         error.results = results

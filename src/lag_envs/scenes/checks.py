@@ -29,7 +29,8 @@ class StepRefused(ArithmeticError):
     trajectory : array of shape (steps + 1, n_state), or None
         What `Scene.simulate` computed before that step.
     results : tuple, or None
-        What a vector environment's step would have returned for the other environments.
+        What a vector environment's step would have returned. Its infos have ``"refused"``, a mask of the
+        environments whose steps were refused; these have a reward of 0.
     """
 
     trajectory: Array | None = None
