@@ -671,14 +671,14 @@ def test_what_is_refused_is_a_type_error_and_a_value_error():
 
 
 def test_unit_of_a_parameter():
-    with pytest.raises(FormulaError, match="the unit of a parameter must be text, got 3"):
+    with pytest.raises(FormulaError, match=r"must be text, as in parameter\(1.0, .kg.\), or .1. for a pure number, got 3"):
         parameter(1.0, 3)
 
 
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        ({"above": 3.0, "below": 2.0}, "no value is above 3 and below 2"),
+        ({"above": 3.0, "below": 2.0}, "the range of a parameter is empty: no value is above 3 and below 2"),
         ({"least": 3.0, "below": 3.0}, "no value is at least 3 and below 3"),
         ({"least": 3.0, "most": 2.0}, "no value is at least 3 and at most 2"),
         ({"usable": (2.0, 1.0)}, r"usable must be (lowest, highest), in this order, got (2.0, 1.0)"),

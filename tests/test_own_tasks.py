@@ -360,10 +360,11 @@ def _guarded(function, x):
         ({"action": {"push": 0.0, "pull": 1.0}}, "limit above 0"),
         (
             {"action": {"push": (1.0, 2.0, 3.0), "pull": 1.0}},
-            r"action\['push'\] must be a limit above 0 or \(low",
+            r"action\['push'\] must be a limit above 0, \(low, high\) or a list of values",
         ),
+        ({"action": {"push": {0.0, 1.0}, "pull": 1.0}}, r"must be .* or a list of values, got \{0.0, 1.0\}"),
         ({"action": {"push": (1.0,), "pull": 1.0}}, "limit above 0"),
-        ({"action": {"push": "far", "pull": 1.0}}, r"^Mistaken.action\['push'\] must be a real number"),
+        ({"action": {"push": "far", "pull": 1.0}}, r"^Mistaken.action\['push'\] must be a limit above 0, .* got 'far'"),
         ({"action": {"push": [1.0, 2.0], "pull": 1.0}}, "mixes lists of values with ranges"),
         ({"action": {"push": [1.0]}}, "at least two values"),
         ({"action": {"push": [1.0, 1.0]}}, r"at least two values, each once, got \[1.0, 1.0\]"),
@@ -521,6 +522,9 @@ def _guarded(function, x):
         ({"check": 1}, r"Mistaken.check must be check\(self\), got 1"),
         ({"defaults": ["m"]}, r"Mistaken.defaults must map names to values, as a dict does, got \['m'\]"),
         ({"imperfections": None}, "Mistaken.imperfections must map names to values, .* got None"),
+        ({"controllers": {"a": 1}}, r"Mistaken.controllers must map names to Controller.*, got 1 for 'a'"),
+        ({"draws": -1}, "Mistaken.draws must be a whole number, 0 or more, got -1"),
+        ({"reward": lambda self, b, after, *_: int(after.x)}, r"no int\(\), .* write xp.floor\(x\)"),
         (
             {"target": {}, "observe": lambda self, after, target, xp: {"x": target.x_goal}},
             "no target 'x_goal', nor any other",
@@ -676,8 +680,17 @@ def test_a_start_as_fast_as_those_of_episodes_is_accepted():
     env = LagrangianEnv(Thrown)
     env.reset(seed=0)
     env.reset(options={"state": env.state})
-    with pytest.raises(ValueError, match="x_dot must lie within ±305 m/s at the start, got 306 m/s"):
+    with pytest.raises(ValueError, match="within ±305 m/s at the start, got 306 m/s; .* `start` reaches"):
         env.reset(options={"state": [0.0, 306.0, 1.0, 0.0, 0.0, 0.0]})
+
+
+def test_a_check_of_starts_returns_nothing():
+    class Checked(own_tasks.Deliver):
+        def check_start(self, state):
+            return state.x < 1.0
+
+    with pytest.raises(FormulaError, match=r"check_start must raise a ValueError or return nothing, got True"):
+        LagrangianEnv(Checked).reset(options={"state": [0.0] * 6})
 
 
 def test_a_task_without_a_scene():

@@ -148,6 +148,8 @@ class Expr:
             return value
         if isinstance(value, Atom):
             return Expr({((value, 1),): 1})
+        if getattr(value, "shape", None) == ():  # one of NumPy's numbers, or an array without dimensions
+            value = value.item()
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise FormulaError(
                 f"a formula combines a recorded number with {value!r}, which is not a real number"
@@ -364,7 +366,10 @@ class Expr:
     __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
 
     def __hash__(self) -> int:
-        remedy = "drop the cache; look up a field that is not a parameter, such as `gear: int = 2`"
+        remedy = (
+            "look up a field that is not a parameter, such as `gear: int = 2`; drop the cache; take functions "
+            "from xp, as in xp.cos, not from SymPy"
+        )
         self._refuse("a look-up in a table, set or cache", remedy)
 
     def __abs__(self) -> Expr:

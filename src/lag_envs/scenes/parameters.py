@@ -47,12 +47,17 @@ def parameter(
         Whether infinity is allowed.
     """
     if not isinstance(unit, str):
-        raise FormulaError(f"the unit of a parameter must be text, got {unit!r:.60}")
+        raise FormulaError(
+            'the unit of a parameter must be text, as in parameter(1.0, "kg"), or "1" for a pure number, got '
+            f"{unit!r:.60}"
+        )
     lows, highs = {"above": above, "at least": least}, {"below": below, "at most": most}
     for (low, bottom), (high, top) in itertools.product(lows.items(), highs.items()):
         strict = low == "above" or high == "below"
         if bottom is not None and top is not None and (bottom > top or (strict and bottom == top)):
-            raise FormulaError(f"no value is {low} {bottom:g} and {high} {top:g}")
+            raise FormulaError(
+                f"the range of a parameter is empty: no value is {low} {bottom:g} and {high} {top:g}"
+            )
     if usable[0] > usable[1]:
         raise FormulaError(f"usable must be (lowest, highest), in this order, got {usable!r}")
     made = callable(default)

@@ -188,7 +188,10 @@ class TracedNumber:
     def __round__(self, digits: Any = None) -> NoReturn:
         raise FormulaError("a compiled formula has no round(); write xp.floor(x + 0.5)")
 
-    __floor__ = __ceil__ = __trunc__ = __int__ = __index__ = __round__
+    def __int__(self) -> NoReturn:
+        raise FormulaError("a compiled formula has no int(), floor() or ceil() of Python; write xp.floor(x)")
+
+    __floor__ = __ceil__ = __trunc__ = __index__ = __int__
 
     def __bool__(self) -> bool:
         raise FormulaError(

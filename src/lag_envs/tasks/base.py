@@ -479,12 +479,15 @@ class Task(_Made):
             fastest = max(FASTEST_START, abs(centre) + half)
             if entry.kind != "place" and abs(value) > fastest:
                 raise ValueError(
-                    f"{entry.name} must lie within ±{fastest:g} {entry.unit} at the start, "
-                    f"got {value:g} {entry.unit}"
+                    f"{entry.name} must lie within ±{fastest:g} {entry.unit} at the start, got {value:g} "
+                    f"{entry.unit}; a task whose `start` reaches further accepts more"
                 )
-        self.check_start(
-            Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True)))
-        )
+        named = Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True)))
+        if (returned := self.check_start(named)) is not None:  # type: ignore[func-returns-value]
+            raise FormulaError(
+                f"{type(self).__name__}.check_start must raise a ValueError or return nothing, "
+                f"got {returned!r:.60}"
+            )
         return array
 
     def check_target(self, target: Any) -> Any:

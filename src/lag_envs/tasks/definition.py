@@ -12,7 +12,7 @@ from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes import picture
 from lag_envs.tasks.formulas import FORMULAS
 from lag_envs.tasks.imperfections import KEYWORDS
-from lag_envs.tasks.record import Examples, Goal, Open, Optimum, ValueIteration
+from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
 
 #: What a task may define besides its attributes; all other public names of `Task` are its calls.
 METHODS = (
@@ -77,6 +77,10 @@ def _fault(base: type, name: str, value: Any) -> str:
         return f"must be {name}({', '.join(inspect.signature(getattr(base, name)).parameters)}), {got}"
     if name in MAPPINGS and not isinstance(value, Mapping):
         return f"must map names to values, as a dict does, {got}"
+    if name == "controllers" and (odd := [n for n, c in value.items() if not isinstance(c, Controller)]):
+        return f"must map names to Controller(...), got {value[odd[0]]!r:.60} for {odd[0]!r}"
+    if name == "draws" and (type(value) is not int or value < 0):
+        return f"must be a whole number, 0 or more, {got}"
     if name in KINDS and not isinstance(value, KINDS[name]):
         what = "text" if KINDS[name] is str else f"a record.{KINDS[name].__name__}"
         return f"must be {what}, {got}; choose another name for a number of your own"

@@ -10,7 +10,7 @@ import itertools
 import math
 import numbers
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from functools import cached_property
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -628,10 +628,13 @@ def _acting(task: Task) -> list[Acting]:
                 raise FormulaError(f"{where} must list at least two values, each once, got {given!r}")
             found.append(Acting(name, known[name], min(values), max(values), values))
             continue
+        forms = f"{where} must be a limit above 0, (low, high) or a list of values, got {given!r:.60}"
+        if isinstance(given, Set | str):
+            raise FormulaError(forms)
         pair = _numbers_of(where, given if isinstance(given, tuple) else (given,))
         pair = pair if isinstance(given, tuple) else (-pair[0], pair[0])
         if len(pair) != 2 or not pair[0] < pair[1]:
-            raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
+            raise FormulaError(forms)
         found.append(Acting(name, known[name], *pair))
     if known and not found:
         raise FormulaError(f"{of}.action must give limits of controls, as in {{{next(iter(known))!r}: 1.0}}")

@@ -51,7 +51,7 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
     if not isinstance(task, str | type):
         raise ValueError(f"register takes a task's class, or 'module:Class', got {task!r:.60}")
     if not id:
-        raise ValueError(f"an id is needed to register {task!r}")
+        raise ValueError(f"an id is needed: write register({task!r}, id=...)")
     gym.register(
         id,
         entry_point="lag_envs.envs.single:LagrangianEnv",
