@@ -671,7 +671,9 @@ def test_what_is_refused_is_a_type_error_and_a_value_error():
 
 
 def test_unit_of_a_parameter():
-    with pytest.raises(FormulaError, match=r"must be text, as in parameter\(1.0, .kg.\), or .1. for a pure number, got 3"):
+    with pytest.raises(
+        FormulaError, match=r"must be text, as in parameter\(1.0, .kg.\), or .1. for a pure number, got 3"
+    ):
         parameter(1.0, 3)
 
 

@@ -15,7 +15,7 @@ from scipy.stats import binom
 from lag_envs.scenes import CartPole, Chain, Pendulum, Scene, StepRefused, parameter
 from lag_envs.scenes.fitting import fit
 from lag_envs.scenes.fitting.parameters import FreeParameters
-from lag_envs.scenes.fitting.recordings import doubtful_units, recordings_of
+from lag_envs.scenes.fitting.recordings import doubtful_rates, doubtful_units, recordings_of
 from lag_envs.scenes.fitting.result import FitWarning
 from tools.docs import fit as docs
 
@@ -396,6 +396,28 @@ def test_degrees():
         scene.fit([(given[0][0][:3], None, 0.02)], ["length"])
 
 
+@pytest.mark.parametrize(
+    ("factors", "dt", "told"),
+    [
+        ([1.0, 180.0 / np.pi], DT, 57.3),
+        ([180.0 / np.pi, 1.0], DT, 0.01745),
+        ([1.0, -1.0], DT, -1.0),
+        ([1.0, 1.0], 10.0 * DT, 10.0),
+        ([1.0, 1.0], DT, None),
+    ],
+)
+def test_rates_that_do_not_belong_to_their_angles(factors, dt, told):
+    """Told from what was measured alone; noise and missing values make no difference."""
+    states, torques = swings()
+    states = states * factors * (1.0 + 0.01 * np.random.default_rng(0).normal(size=states.shape))
+    states[30:33, 0] = np.nan
+    found = doubtful_rates(Pendulum(), recordings_of(Pendulum(), [(states, torques, dt)]))
+    assert len(found) == bool(told)
+    if told:
+        (stated,) = re.findall("^theta_dot is (.*) times the rate at which theta changes", found[0])
+        assert float(stated) == pytest.approx(told, rel=0.05)
+
+
 def test_an_interval_in_milliseconds():
     """It is told at once; the search would take minutes."""
     states, torques = swings()
@@ -484,7 +506,7 @@ def test_bad_input(recordings, keywords, message):
 
 
 def test_a_first_guess_that_cannot_be_simulated():
-    with pytest.raises(StepRefused, match="step 0"):
+    with pytest.raises(StepRefused, match=r"Check the units of the data .*step 0"):
         Pendulum(gravity=1e50).fit([(STATES, None, DT)], ["length"])
     with pytest.raises(
         StepRefused, match=r"guess .*: a, not measured, was guessed to be 0 .*; measure it too"

@@ -364,7 +364,10 @@ def _guarded(function, x):
         ),
         ({"action": {"push": {0.0, 1.0}, "pull": 1.0}}, r"must be .* or a list of values, got \{0.0, 1.0\}"),
         ({"action": {"push": (1.0,), "pull": 1.0}}, "limit above 0"),
-        ({"action": {"push": "far", "pull": 1.0}}, r"^Mistaken.action\['push'\] must be a limit above 0, .* got 'far'"),
+        (
+            {"action": {"push": "far", "pull": 1.0}},
+            r"^Mistaken.action\['push'\] must be a limit above 0, .* got 'far'",
+        ),
         ({"action": {"push": [1.0, 2.0], "pull": 1.0}}, "mixes lists of values with ranges"),
         ({"action": {"push": [1.0]}}, "at least two values"),
         ({"action": {"push": [1.0, 1.0]}}, r"at least two values, each once, got \[1.0, 1.0\]"),
@@ -680,7 +683,7 @@ def test_a_start_as_fast_as_those_of_episodes_is_accepted():
     env = LagrangianEnv(Thrown)
     env.reset(seed=0)
     env.reset(options={"state": env.state})
-    with pytest.raises(ValueError, match="within ±305 m/s at the start, got 306 m/s; .* `start` reaches"):
+    with pytest.raises(ValueError, match=r"within ±305 m/s at the start, got 306 m/s; .* `start` reaches"):
         env.reset(options={"state": [0.0, 306.0, 1.0, 0.0, 0.0, 0.0]})
 
 
@@ -689,7 +692,9 @@ def test_a_check_of_starts_returns_nothing():
         def check_start(self, state):
             return state.x < 1.0
 
-    with pytest.raises(FormulaError, match=r"check_start must raise a ValueError or return nothing, got True"):
+    with pytest.raises(
+        FormulaError, match=r"check_start must raise a ValueError or return nothing, got True"
+    ):
         LagrangianEnv(Checked).reset(options={"state": [0.0] * 6})
 
 

@@ -367,8 +367,8 @@ class Expr:
 
     def __hash__(self) -> int:
         remedy = (
-            "look up a field that is not a parameter, such as `gear: int = 2`; drop the cache; take functions "
-            "from xp, as in xp.cos, not from SymPy"
+            "look up a field that is not a parameter, such as `gear: int = 2`; drop the cache; take "
+            "functions from xp, as in xp.cos, not from SymPy"
         )
         self._refuse("a look-up in a table, set or cache", remedy)
 

@@ -20,6 +20,7 @@ from lag_envs.scenes.fitting.parameters import ENDLESS, FreeParameters
 from lag_envs.scenes.fitting.recordings import (
     Recording,
     doubtful_interval,
+    doubtful_rates,
     doubtful_units,
     guess,
     recordings_of,
@@ -78,7 +79,7 @@ def fit(
         raise ValueError(f"level must be between 0 and 1, got {level:g}")
     data = recordings_of(scene, recordings)
     sizes, parameters = _Sizes(scene, data, noise), FreeParameters(scene, names)
-    doubts = doubtful_units(scene, data)
+    doubts = doubtful_units(scene, data) + doubtful_rates(scene, data)
     doubts += doubtful_interval(parameters.scene(parameters.start), data, sizes.guesses)
     for text in doubts:  # now, for the search would be long and may fail
         warnings.warn(text, FitWarning, stacklevel=3)
@@ -88,18 +89,21 @@ def fit(
             f"{sizes.count} measured values are too few for {len(names)} parameters and the "
             f"{unknowns - len(names)} entries of the starts of {len(data)} recordings; record longer"
         )
-    shooting, z = _approach(parameters, data, sizes)
-    relaxed = sizes.noise.copy()
-    for part in CLOSING:
-        shooting = shooting.weighed(sizes.noise, part * sizes.gap)
-        z = shooting.solve(z, COARSE).x
-    for _ in range(WEIGHINGS):
-        shooting = shooting.weighed(sizes.noise, CLOSING[-1] * sizes.gap)
-        found = shooting.solve(z, FINE)
-        z, known = found.x, _determined(shooting, found.x, sizes.range)
-        sizes.estimate(shooting, z, known.leverage)
-        if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
-            break
+    try:
+        shooting, z = _approach(parameters, data, sizes)
+        relaxed = sizes.noise.copy()
+        for part in CLOSING:
+            shooting = shooting.weighed(sizes.noise, part * sizes.gap)
+            z = shooting.solve(z, COARSE).x
+        for _ in range(WEIGHINGS):
+            shooting = shooting.weighed(sizes.noise, CLOSING[-1] * sizes.gap)
+            found = shooting.solve(z, FINE)
+            z, known = found.x, _determined(shooting, found.x, sizes.range)
+            sizes.estimate(shooting, z, known.leverage)
+            if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
+                break
+    except StepRefused as error:
+        raise _explained(error, scene, data, sizes) from error
     return _result(shooting, found, known, sizes, relaxed, level, doubts)
 
 
@@ -180,10 +184,7 @@ def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) 
         starts = [sizes.guesses[piece.recording][piece.first] for piece in pieces]
         shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
         z = np.concatenate([z[:p], *starts])
-        try:
-            shooting.simulate(z)
-        except StepRefused as error:
-            raise _explained(error, parameters.scene(z[:p]), data, sizes) from error
+        shooting.simulate(z)  # a first guess may be refused
         z[:p] = shooting.solve(z, COARSE, starts=False).x
         sizes.estimate(shooting, z)
     shooting = shooting.weighed(sizes.noise, sizes.gap)
@@ -193,7 +194,7 @@ def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) 
 
 
 def _explained(error: StepRefused, scene: Scene, data: list[Recording], sizes: _Sizes) -> StepRefused:
-    """Return the error of a first simulation, with the coordinates that were guessed to be 0."""
+    """Return the error of a simulation, with coordinates that were guessed to be 0, or other suspects."""
     guessed = [
         entry.name
         for i, entry in enumerate(layout_of(scene).state)
@@ -203,7 +204,10 @@ def _explained(error: StepRefused, scene: Scene, data: list[Recording], sizes: _
         )
     ]
     if not guessed:
-        return error
+        return StepRefused(
+            "the search met a motion that cannot be simulated, or not differentiated. Check the units of the "
+            f"data (angles in radians, dt in seconds) and the scene's own values ({error})"
+        )
     return StepRefused(
         f"the first guess cannot be simulated: {' and '.join(guessed)}, not measured, was guessed to be 0 at "
         f"the start; measure it too ({error})"
@@ -269,7 +273,7 @@ def _result(
     )
     texts = misread = _misread(fitted, sizes)
     if not found.success:
-        remedy = "" if misread else "; begin closer to the truth"
+        remedy = "" if misread or doubts else "; begin closer to the truth"
         texts = [*texts, f"the search ended before it converged{remedy}"]
     texts = [
         *texts,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import numbers
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,9 @@ TRIED, MOST_TRIED, COMPARED = 16, 4096, 64
 MANY_TURNS, OFTEN = 100.0, 0.1
 #: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
+#: A place's changes over so many samples are compared with the integral of its rate. They are alike if they
+#: correlate by this much; then neither should be more than this many times the other.
+SPAN, ALIKE, AS_LARGE = 4, 0.9, 3.0
 #: A step of more substeps than this is long: the steps of well-sampled motions need a few.
 LONG = 40
 
@@ -167,6 +171,35 @@ def doubtful_units(scene: Scene, data: Sequence[Recording]) -> list[str]:
                 "np.radians"
             )
     return texts
+
+
+def doubtful_rates(scene: Scene, data: Sequence[Recording]) -> list[str]:
+    """Return warnings about rates that are not those of their places: unit, sign or dt may be wrong."""
+    texts, names, entries = [], scene.state_names, layout_of(scene).state
+    for i, place in enumerate(entries):
+        rates = [j for j, e in enumerate(entries) if (e.coordinate, e.kind) == (place.coordinate, "velocity")]
+        if place.kind != "place" or not rates:
+            continue
+        pairs = np.concatenate([_changes(r.states[:, i], r.states[:, rates[0]], r.dt) for r in data])
+        squares, product = np.sum(pairs**2, axis=0), pairs[:, 0] @ pairs[:, 1]
+        if not product or abs(product) < ALIKE * math.sqrt(squares[0] * squares[1]):
+            continue
+        factor = squares[1] / product
+        if not 1.0 / AS_LARGE < factor < AS_LARGE:
+            texts.append(
+                f"{names[rates[0]]} is {factor:.3g} times the rate at which {names[i]} changes: check units "
+                "(radians or degrees), signs, the order of the columns and dt"
+            )
+    return texts
+
+
+def _changes(places: Array, rates: Array, dt: float) -> Array:
+    """Return changes of a place over `SPAN` samples, and the integrals of its rate, shape (n, 2)."""
+    ahead = places[SPAN:] - places[:-SPAN]
+    steps = 0.5 * dt * (rates[1:] + rates[:-1])
+    sums = sum((steps[k : len(steps) - SPAN + 1 + k] for k in range(SPAN)), start=np.zeros(len(ahead)))
+    pairs = np.stack([ahead, sums], axis=1)
+    return pairs[np.isfinite(pairs).all(axis=1)]
 
 
 def doubtful_interval(scene: Scene, data: Sequence[Recording], guesses: Sequence[Array]) -> list[str]:
