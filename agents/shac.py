@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
+from itertools import product
 from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
@@ -117,7 +118,8 @@ class Learner:
     Raises
     ------
     UserError
-        For an environment without derivatives, and for start ranges of unknown states.
+        For an environment without derivatives, and for start ranges of unknown states, or beyond the
+        starts that the task accepts.
     """
 
     def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
@@ -134,6 +136,11 @@ class Learner:
         if unknown := [name for name in settings.start_ranges if name not in names]:
             raise UserError(f"start_ranges: {env_id} has no state {unknown[0]!r}; it has {', '.join(names)}")
         self.half_widths = np.array([settings.start_ranges.get(name, 0.0) for name in names])
+        for corner in product((-1.0, 1.0), repeat=len(names)):
+            try:
+                self.task.start_state(self.task.centre + corner * self.half_widths)
+            except ValueError as error:
+                raise UserError(f"start_ranges reach beyond what {env_id} accepts: {error}") from error
         self.envs: Any = gym.make_vec(env_id, settings.n_envs, autoreset_mode="Disabled").unwrapped
         # If windows are shorter than episodes, the first episodes end at staggered times, so that each window
         # contains all phases.

@@ -73,6 +73,7 @@ def test_it_swings_the_bar_up(env_id, changes, least):
         ("shac", FREE, {"gama": 0.9}, "settings of shac: gama is an unknown key"),
         ("shac", FREE, {"start_ranges": {}}, "random_starts=0.5 needs start_ranges, got none"),
         ("shac", FREE, {"start_ranges": {"phi": 1.0}}, "has no state 'phi'; it has theta, theta_dot"),
+        ("shac", TRACK, {"start_ranges": {"s": 1.0}}, "start_ranges reach beyond what .* accepts: .*s=-1 m"),
         ("shac", cart_pole.CartPoleExact.id, {}, "shac needs gradients: CartPoleExact-v0 has a list"),
         ("shac", pivoted_bar.SwingUpUnknown.id, {}, "needs gradients: PivotedBarUnknown-v0 has imperfect"),
         ("cloning", cart_pole.CartPoleExact.id, {}, "has discrete ones; try fast_ppo"),
