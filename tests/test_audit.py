@@ -360,6 +360,17 @@ def test_a_nonce_of_another_branch(board):
     assert "is not a commit in the history" in wrong(board)["nonces"][0]
 
 
+def test_a_process_that_dies_is_told(board, monkeypatch):
+    def shared(work, function, jobs):
+        assert jobs == 2
+        return ((key, RuntimeError("gone")) for key, _ in work)
+
+    monkeypatch.setattr(audit, "shared", shared)
+    assert (
+        "has policies that cannot be played: RuntimeError: gone; verify" in wrong(board, jobs=2)["scores"][0]
+    )
+
+
 def test_a_nonce_without_a_public_source(board):
     board.publish("chosen-by-me")
     assert "names no public source" in wrong(board)["nonces"][0]
