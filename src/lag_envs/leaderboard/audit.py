@@ -517,9 +517,11 @@ def _playable(
 def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any], jobs: int) -> Finding:
     """Play the recorded episodes of each policy again, and some more that cannot be foreseen."""
     finding, played, wrong = Finding("scores"), 0, {}
+    every = _playable(board, found, lambda entry: None)
+    long_first = sorted(every, key=lambda one: not one[1].architecture.plans)
     work = [
         ((entry, where), (board.submission(entry.id), result, way))
-        for entry, _, result, way, where in _playable(board, found, lambda entry: None)
+        for entry, _, result, way, where in long_first
     ]
     for (entry, where), outcome in shared(work, _played_again, jobs):
         progress(entry)
