@@ -34,7 +34,7 @@ FEW, LONGEST = 4096, 1000
 #: Number of batches of random actions, used in turn while time is measured.
 BATCHES = 16
 #: Steps in one call of gymnax, and how many of them are unrolled, up to a number of environments: the fastest
-#: of three forms on an H100.
+#: forms that were found on an H100.
 GYMNAX = {2**16: (64, 4), 2**62: (16, 1)}
 
 Run = Callable[[], Any]

@@ -24,8 +24,8 @@ from lag_envs.tasks.base import Task
 APART = ("--fmad=false", "-ffp-contract=off")
 
 #: Sizes of the array of coefficients up to which a GPU's loops are unrolled, in single and double precision.
-#: The coefficients are then in registers. On an H100 this makes steps up to twice as fast; beyond these sizes
-#: registers do not suffice, and steps of a triple pendulum in double precision become a fifth slower.
+#: The coefficients are then in registers. On an H100 this makes steps up to 2.5 times as fast. Larger arrays
+#: do not fit: in double precision steps of a triple pendulum would become a fifth slower.
 ROOM = {True: 1000, False: 200}
 
 _HEAD = """\

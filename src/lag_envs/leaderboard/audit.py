@@ -51,12 +51,12 @@ from lag_envs.leaderboard.log import (
 )
 from lag_envs.leaderboard.parallel import shared
 from lag_envs.leaderboard.pending import Neighbours, claimed, shown_episodes
-from lag_envs.leaderboard.results import apart, code_digest, compare_results
+from lag_envs.leaderboard.results import VerificationComparison, apart, code_digest, compare_results
 from lag_envs.store import write_file
 from lag_envs.workers import died
 
 if TYPE_CHECKING:
-    from lag_envs.leaderboard.submission import About, Submission
+    from lag_envs.leaderboard.submission import About
 
 #: The release's record of the repository's board.
 PIN = Path(__file__).with_name("pin.json")
@@ -473,15 +473,14 @@ def audit(
     progress : callable
         Called with each entry when its result is checked.
     jobs : int
-        Number of processes that play the sampled episodes.
+        Number of processes that play the episodes.
     """
     found = cheap(board, pin)
     findings = list(found.findings)
     for finding in findings:
         tell(finding)
     if not found.findings[0].wrong:
-        given = board, found, progress
-        scores = partial(_all, *given) if everything else partial(_sample, *given, jobs)
+        scores = partial(_all if everything else _sample, board, found, progress, jobs)
         for check in (partial(_nonces, board, found), scores):
             finding = check()
             findings.append(finding)
@@ -489,40 +488,36 @@ def audit(
     return not any(finding.wrong for finding in findings)
 
 
-def _playable(
-    board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]
-) -> Iterator[tuple[BoardEntry, Submission, dict[str, Any], float, str]]:
-    """Yield all that can be verified again.
+def _work(board: Board, found: CheapChecks) -> list[tuple[tuple[BoardEntry, str], tuple]]:
+    """Return all that can be verified again: entry and place for messages; folder, result, way and nonce.
 
-    Each has an entry, its submission, its result, the best return minus random, and a place for messages.
+    The way is the best return minus random. Submissions that plan come first, because they take longest.
     """
     from lag_envs.leaderboard.submission import Refused, load
 
+    work: list[tuple[tuple[BoardEntry, str], tuple]] = []
     for (number, id), result in found.results.items():
         entry = found.state.boards[number][id]
         told = found.state.protocols.get(number)
         scale = told.scales.get(entry.env) if told else None
         if told is None or scale is None or told.rules.model_dump() != protocol.rules():
             continue
-        progress(entry)
+        folder = board.submission(entry.id)
         try:
-            submission = load(board.submission(entry.id))
+            submission = load(folder)
         except Refused:
             continue
         if submission.digest == entry.digest:  # otherwise already reported
             where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
-            yield entry, submission, result, scale.best - scale.random, where
+            one = (entry, where), (folder, result, scale.best - scale.random, entry.nonce)
+            work.insert(0 if submission.architecture.plans else len(work), one)
+    return work
 
 
 def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any], jobs: int) -> Finding:
     """Play the recorded episodes of each policy again, and some more that cannot be foreseen."""
     finding, played, wrong = Finding("scores"), 0, {}
-    every = _playable(board, found, lambda entry: None)
-    long_first = sorted(every, key=lambda one: not one[1].architecture.plans)
-    work = [
-        ((entry, where), (board.submission(entry.id), result, way))
-        for entry, _, result, way, where in long_first
-    ]
+    work = _work(board, found)
     for (entry, where), outcome in shared(work, _played_again, jobs):
         progress(entry)
         if isinstance(outcome, BaseException):
@@ -534,7 +529,7 @@ def _sample(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], A
     return finding
 
 
-def _played_again(folder: Path, result: dict[str, Any], way: float) -> tuple[int, list[str]]:
+def _played_again(folder: Path, result: dict[str, Any], way: float, _: str) -> tuple[int, list[str]]:
     """Play some episodes of a submission again; return how many, and in what they differ from its result."""
     from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused, load
@@ -590,27 +585,33 @@ def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
     )
 
 
-def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]) -> Finding:
+def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any], jobs: int) -> Finding:
     """Verify every result again, compare all submissions, and play the references."""
-    from lag_envs.leaderboard.submission import Refused
-    from lag_envs.leaderboard.verify import verify
-
-    finding, same, bits = Finding("scores"), 0, 0
-    for entry, submission, result, way, where in _playable(board, found, progress):
-        try:
-            again = verify(submission, entry.nonce, result["episodes"])
-            compared = compare_results(result, again, way, submission.architecture.plans)
-        except (Refused, ValueError) as error:
-            finding.wrong.append(
-                f"{where} cannot be verified again: {ascii_text(error)}; withdraw {entry.id}"
-            )
+    finding, same, bits, wrong = Finding("scores"), 0, 0, {}
+    work = _work(board, found)
+    for (entry, where), outcome in shared(work, _verified_again, jobs):
+        progress(entry)
+        if isinstance(outcome, BaseException):
+            why = str(outcome) if isinstance(outcome, ValueError) else died(outcome)
+            wrong[where] = [f"{where} cannot be verified again: {ascii_text(why)}; withdraw {entry.id}"]
             continue
-        finding.wrong += [f"{where} differs in {what}; verify {entry.id} again" for what in compared.far]
-        same, bits = same + (not compared.far), bits + compared.same
+        wrong[where] = [f"{where} differs in {what}; verify {entry.id} again" for what in outcome.far]
+        same, bits = same + (not outcome.far), bits + outcome.same
+    finding.wrong += [text for (_, where), _ in work for text in wrong[where]]
     finding.told = f"{same} results were reproduced, {bits} of them to the bit"
     for what in (*_links(board, found), *_references(found)):
         finding.wrong.append(what)
     return finding
+
+
+def _verified_again(folder: Path, result: dict[str, Any], way: float, nonce: str) -> VerificationComparison:
+    """Verify a submission again, and compare with its result."""
+    from lag_envs.leaderboard.submission import load
+    from lag_envs.leaderboard.verify import verify
+
+    submission = load(folder)
+    again = verify(submission, nonce, result["episodes"])
+    return compare_results(result, again, way, submission.architecture.plans)
 
 
 def _links(board: Board, found: CheapChecks) -> Iterator[str]:

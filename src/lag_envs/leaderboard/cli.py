@@ -121,9 +121,8 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "--all", action="store_true", help="verify every result again, instead of a few episodes (minutes)"
     )
     one.add_argument(
-        "--jobs", metavar="N", type=count, default=1,
-        help="processes that play the few episodes (default: 1)",
-    )  # fmt: skip
+        "--jobs", metavar="N", type=count, default=1, help="processes that play episodes (default: 1)"
+    )
     one.add_argument(
         "--pin", metavar="FILE", type=Path, help="pin to check the log against (default: the release's)"
     )
