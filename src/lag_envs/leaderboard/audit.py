@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, others
 from lag_envs.leaderboard.fields import Strict, ascii_text, checked, shown_ascii
@@ -592,7 +593,7 @@ def _all(board: Board, found: CheapChecks, progress: Callable[[BoardEntry], Any]
     for (entry, where), outcome in shared(work, _verified_again, jobs):
         progress(entry)
         if isinstance(outcome, BaseException):
-            why = str(outcome) if isinstance(outcome, ValueError) else died(outcome)
+            why = str(outcome) if isinstance(outcome, UserError | ValueError) else died(outcome)
             wrong[where] = [f"{where} cannot be verified again: {ascii_text(why)}; withdraw {entry.id}"]
             continue
         wrong[where] = [f"{where} differs in {what}; verify {entry.id} again" for what in outcome.far]
