@@ -17,7 +17,7 @@ from lag_envs.envs.readout import STRIP_PAPER
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.picture import Picture, left_out_rates
 from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Polygon, Pose, Ruler, Window, beginning, placed
-from lag_envs.scores import score
+from lag_envs.scores import known_returns, score
 from lag_envs.tasks import Task, cylinder_in_cylinder, incline, pivoted_bar
 
 pygame = pytest.importorskip("pygame")
@@ -428,7 +428,7 @@ def test_what_cannot_be_shown_is_refused(option, message):
 
 
 def test_readout_counts_the_episode(monkeypatch):
-    """The score comes at the end: where rewards are negative, the first part would score above 1."""
+    """Before the end, a random policy's return counts in proportion to the time that has passed."""
     seen = []
     monkeypatch.setattr(readout.Readout, "write", lambda self, image, groups, scale: seen.append(groups))
     made = {"render_mode": "rgb_array", "show_readout": True}
@@ -446,11 +446,12 @@ def test_readout_counts_the_episode(monkeypatch):
             for one in (env, envs, cut):
                 one.render()
             assert all(groups[0][2].name == "s_ddot" for groups in seen)
-            known = [groups[0][3].value for groups in seen[-3:-1]]
-            assert known == pytest.approx(
-                2 * [score("PivotedBar-v0", total) if n == last else math.nan], nan_ok=True
-            )
-            assert math.isnan(seen[-1][0][3].value)  # cut short
+            known = known_returns("PivotedBar-v0")
+            so_far = (total - n / last * known.random) / (known.best - known.random)
+            assert [groups[0][3].value for groups in seen[-3:-1]] == pytest.approx([so_far, so_far])
+            if n == 3:  # cut short by then
+                assert seen[-1][0][3].value == pytest.approx(so_far)
+    assert so_far == pytest.approx(score("PivotedBar-v0", total))
     (first, second) = seen[-3]
     assert [(r.name, r.unit) for r in first] == [
         ("time", "s"),

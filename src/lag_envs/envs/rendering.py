@@ -38,7 +38,7 @@ class Look(NamedTuple):
     trail : float [s]
         How long the bodies' trails are.
     readout : bool
-        Whether time, return, controls and state are written below, and the score once the episode is over.
+        Whether time, return, controls, score and state are written below.
     """
 
     arrows: bool = False
@@ -130,7 +130,7 @@ class Viewer:
         episode : int
             A number that identifies the episode.
         over : bool
-            Whether the episode is over and therefore has a score.
+            Whether the episode is over.
 
         Returns
         -------
@@ -199,14 +199,15 @@ class Viewer:
     def _readings(self, now: Frame, seconds: float, total: float, over: bool) -> list[list[Reading]]:
         """Return the groups of the read-out, the most important first.
 
-        An episode has a score only at its end: with negative rewards, the beginning of an episode would score
-        above 1.
+        Before an episode's end, a random policy's return counts in proportion to the time that has passed, so
+        that the score begins at 0.
         """
         task = self._task
         first = [Reading("time", seconds, "s"), Reading("return", total, ""), *task.control_readings(now)]
         if self._scale is not None:
             random, best = self._scale
-            first.append(Reading("score", (total - random) / (best - random) if over else math.nan, ""))
+            passed = 1.0 if over else seconds / task.duration
+            first.append(Reading("score", (total - random * passed) / (best - random), ""))
         names = zip(task.scene.state_names, now.state, task.scene.state_units, strict=True)
         return [[*first, *task.readings(now)], [Reading(*entry) for entry in names]]
 

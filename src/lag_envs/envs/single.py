@@ -53,8 +53,8 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         How far back the bodies' trails in pictures go. A trail joins the states for which `render` was
         called, so call `render` after every step.
     show_readout : bool, default False
-        Whether time, return, controls and state are written below a picture, and the score once the episode
-        is over. In small pictures the last of them are left out.
+        Whether time, return, controls, score and state are written below a picture. In small pictures the
+        last of them are left out.
     **options
         Parameters of the scene and of the task: ``mass``, ``damping``, ``dt``, ``duration``, ``target``, ...;
         and hidden parameters, imperfect sensors and actuators: ``randomize``, ``observation_noise``,

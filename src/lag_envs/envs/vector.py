@@ -340,7 +340,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         targets = self.target if self.target is not None else [None] * self.num_envs
         of_each = (self.state, self.control, targets, self._steps.tolist(), self._totals.tolist())
         episodes = self._keys[2].tolist()
-        # An episode that `max_episode_steps` cuts short has no score.
+        # An episode that `max_episode_steps` cuts short is scored as one that goes on.
         over = ((self._read("n") < 0.0) & (self.limits == self.task.limit)).tolist()
         pictures = tuple(
             viewer.draw(*now) for viewer, *now in zip(self._viewers, *of_each, episodes, over, strict=False)

@@ -160,7 +160,11 @@ function open(root, board, code, tools) {
   const { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, hash, calm } = tools;
   const { about } = code;
   const known = board.known && board.known.best !== board.known.random ? board.known : null;
-  const scoreOf = (total) => (total - known.random) / (known.best - known.random);
+  /** Before an episode's end, a random policy's return counts in proportion to the time that has passed. */
+  const scoreOf = (episode) => {
+    const passed = finished(episode) ? 1 : episode.steps / (about.limit ?? Infinity);
+    return (episode.total - known.random * passed) / (known.best - known.random);
+  };
 
   const option = (value, words) => make("option", { value }, words);
   const button = (name, words) => make("button", { type: "button", class: name }, words);
@@ -258,8 +262,8 @@ function open(root, board, code, tools) {
   const finished = (episode) => episode.over === "terminated" || episode.over === "truncated";
   const ended = () => Boolean(me.over || (rerunning && !rerunning.keys[me.steps]));
 
-  /** A return, and its score if the episode is whole: where rewards are costs, a part of an episode looks too good. */
-  const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode.total))}` : ""}`;
+  /** A return, and its score if the episode is whole. */
+  const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode))}` : ""}`;
 
   const tell = (words, spoken = words) => {
     message.textContent = words;
@@ -560,7 +564,7 @@ function open(root, board, code, tools) {
   }
 
   function readOut(beside) {
-    const score = known && (finished(me) ? text(scoreOf(me.total)) : !ended() && "at the end") || "–";
+    const score = known && (finished(me) ? text(scoreOf(me)) : !ended() && `${text(scoreOf(me))} so far`) || "–";
     writeList(readout, [
       ["Time", `${text(me.steps * about.dt, 2)} s`],
       ["Return", text(me.total, 2)],
