@@ -108,7 +108,7 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--readout", action="store_true",
-        help="show time, return, controls and state below the picture, and the score once an episode is over",
+        help="show time, return, controls, score and state below the picture",
     )  # fmt: skip
 
 
