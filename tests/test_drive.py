@@ -404,8 +404,11 @@ def test_a_changed_machine_is_not_scored(drive):
     page.keyboard.press("Space")
     assert reading(page, "Score") == "not scored"
     assert page.evaluate("document.querySelector('.copy').disabled")
+    field = page.locator(".share input")
+    assert field.get_attribute("placeholder") == "Drives of a changed machine have no link"
     page.click(".reset")
     assert "scored again" in message(page)
+    assert field.get_attribute("placeholder") == "Your drive's link, once it stops"
 
 
 @pytest.fixture(scope="module")

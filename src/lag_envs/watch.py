@@ -97,7 +97,7 @@ def load_agent(env_id: str, task: Any, name: str | None, board: Path | None = No
         more = "" if on_board else " (for an agent of a leaderboard, give the board's folder: --board FOLDER)"
         raise UserError(
             f"{env_id} has no agent {name!r}, and there is no such file{more}; "
-            f"{hint(name, [*names.values(), *on_board])}"
+            f"{hint(name, dict.fromkeys([*names.values(), *on_board]))}"
         )
     folder = path.parent if path.name == "submission.toml" or path.suffix == ".safetensors" else path
     if (folder / "submission.toml").is_file():

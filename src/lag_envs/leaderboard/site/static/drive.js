@@ -187,7 +187,7 @@ function open(root, board, code, tools) {
   const [episodeLabel, episodeSelect] = list("The ghost's episode", []);
   const bar = make("div", { class: "drive-controls", role: "group", "aria-label": "Driving" }, go, again, fresh, watch, speedLabel, ghostLabel, episodeLabel);
   const verdict = make("p", { class: "verdict", role: "status" });
-  const link = make("input", { type: "text", readonly: "", "aria-label": "Link of this drive", placeholder: "Your drive's link, once it stops" });
+  const link = make("input", { type: "text", readonly: "", "aria-label": "Link of this drive" });
   const copy = button("copy", "Copy link");
   const share = make("div", { class: "share" }, link, copy);
   const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
@@ -467,6 +467,7 @@ function open(root, board, code, tools) {
 
   function setLink(value) {
     link.value = value;
+    link.placeholder = untouched() ? "Your drive's link, once it stops" : "Drives of a changed machine have no link";
     copy.disabled = !value;
   }
 
