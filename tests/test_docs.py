@@ -489,8 +489,6 @@ def test_speeds_on_a_gpu():
     assert "take 20 billion steps a second in float32 and 10 billion in float64" in usage
     assert f"at {100 * single['replayed_share']:.0f} % of the rate at which the memory can copy" in usage
     assert "20 billion steps a second" in readme and "20 billion steps a second" in changes
-    ratios = [row["replayed"] / row["gymnax"] for row in measured["rows"] if "gymnax" in row]
-    assert f"{min(ratios):.1f} to {max(ratios):.1f} times\n  as many as gymnax's" in changes
     assert {id for id, *_ in rows} <= set(TASKS)
 
 

@@ -60,7 +60,7 @@ def gymnax(n: int, env_id: str = "Pendulum-v1", together: int = 8, unroll: int =
         calls = -(-steps // together)
         for _ in range(calls):
             key, state, seen = several(key, state)
-            jax.block_until_ready(seen)
+        jax.block_until_ready(seen)
         return calls * together
 
     return run
