@@ -145,8 +145,9 @@ def reading(page, name):
 
 
 def readout(name):
-    """Return the expression for a text of the read-out."""
-    return f"""[...document.querySelectorAll('.driver .readout dt')]
+    """Return the expression for a text of the read-out; while one drives, of what stands for its picture."""
+    return f"""[...document.querySelectorAll(
+            document.querySelector('.stage[data-driving]') ? '.driver .values dt' : '.driver .readout dt')]
         .find((e) => e.textContent === {json.dumps(name)})?.nextSibling.textContent"""
 
 

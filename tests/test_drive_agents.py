@@ -19,6 +19,7 @@ from driving import (
     made,
     message,
     reading,
+    readout,
     shows,
 )
 from later_policies import EVERY as LATER
@@ -162,7 +163,7 @@ def test_ghosts_run_beside(drive, haunted):
     page.select_option(ghosts, "live:0")
     page.focus(".stage")
     page.keyboard.press("Space")
-    until(page, "parseFloat(document.querySelector('.driver .readout dd').textContent) > 0.3")
+    until(page, readout("Time"), lambda text: (text or "") > "0.3")
     assert reading(page, "Ghost's return") not in (None, "–")
     page.select_option(ghosts, "stored:1")
     until(page, "!document.querySelectorAll('.drive-controls label')[2].hidden")
@@ -181,7 +182,7 @@ def test_a_ghost_that_comes_late_or_never(drive, haunted):
     page.evaluate(HOLD)
     page.focus(".stage")
     page.keyboard.down("ArrowRight")
-    until(page, "parseFloat(document.querySelector('.driver .readout dd').textContent) > 0.1")
+    until(page, readout("Time"), lambda text: (text or "") > "0.1")
     page.select_option(".drive-controls select >> nth=1", "live:0")
     assert message(page) == "Loading the ghost …"
     assert page.text_content(".go") == "Resume" and page.evaluate("document.querySelector('.go').disabled")

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import tomllib
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -16,6 +17,7 @@ from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import render, write_page
 from lag_envs.leaderboard.site.driving import sliders
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
+from lag_envs.leaderboard.standings import ORIGINS
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS, acrobot, cylinder_in_cylinder, incline, pendulum
 from tests import board_pages
@@ -145,6 +147,20 @@ def test_submissions_are_linked_where_their_files_are_public():
         assert f'href="{main}{link}"' in there and link not in without
     linked = re.findall(f'href="{main}(src/[^"]+)"', there)
     assert len(linked) == 2 and all((site.PACKAGE.parents[1] / link).is_file() for link in linked)
+
+
+def test_every_agent_of_the_board_has_a_link_to_its_code():
+    """Learners and tables by what they say of themselves, unless they name an address."""
+    root = site.PACKAGE.parents[1]
+    found = [
+        tomllib.loads(file.read_text()) for file in root.glob("leaderboard/submissions/*/submission.toml")
+    ]
+    silent = [told for told in found if "code" not in told and told["policy"]["architecture"] != "controller"]
+    origins = [
+        [m for start, m in ORIGINS.items() if told["description"].startswith(start)] for told in silent
+    ]
+    assert silent and all(len(modules) == 1 for modules in origins)
+    assert all((root / site.place_of(module)).is_file() for module in ORIGINS.values())
 
 
 def test_numbers_of_a_column_line_up():

@@ -18,6 +18,13 @@ from lag_envs.tasks import TASKS
 if TYPE_CHECKING:
     from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
 
+#: Modules of the project's own agents whose frozen submissions name no code, by how their descriptions begin.
+ORIGINS = {
+    "agents.ppo, ": "agents.ppo",
+    "Stable-Baselines3, ": "agents.learners",
+    "value iteration on ": "agents.optimum",
+}
+
 
 def page_data(board: Board) -> dict[str, Any]:
     """Return `board_data` and what only the page needs: agents that run on the page, and human drives."""
@@ -35,7 +42,9 @@ def page_data(board: Board) -> dict[str, Any]:
             middle, _ = shown_episodes(board.result(results[row["id"]]))
             submission = load(board.submission(row["id"]))
             row["agent"] = agent(submission.policies[middle][1])
-            row["module"] = submission.architecture.module
+            row["module"] = submission.architecture.module or next(
+                (module for start, module in ORIGINS.items() if submission.description.startswith(start)), ""
+            )
     return data
 
 

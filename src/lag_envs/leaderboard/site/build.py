@@ -470,13 +470,17 @@ def condition(name: str) -> str:
 
 
 def place_of(module: str | None) -> str | None:
-    """Return the path of a module of the package in the project; None if it has none.
+    """Return the path of a module of the package or of the agents in the project; None if it has none.
 
     Examples
     --------
     >>> place_of("lag_envs.controllers.basic"), place_of("lag_envs.controllers"), place_of("lag_envs.gone")
     ('src/lag_envs/controllers/basic.py', 'src/lag_envs/controllers/__init__.py', None)
+    >>> place_of("agents.ppo")
+    'agents/ppo.py'
     """
+    if re.fullmatch(r"agents\.\w+", module or ""):  # not in the wheel
+        return f"{str(module).replace('.', '/')}.py"
     if not re.fullmatch(r"lag_envs(\.\w+)+", module or ""):
         return None
     path = str(module).replace(".", "/")

@@ -177,6 +177,8 @@ function open(root, board, code, tools) {
   const message = make("p", { class: "message" });
   const stage = make("div", { class: "stage", tabindex: "0", role: "application" }, canvas, message);
   const readout = make("dl", { class: "readout" });
+  const spoken = make("dl");
+  const values = make("canvas", { class: "values" }, spoken);
   const said = make("p", { class: "hear", role: "status" });
   const go = button("go", "Start");
   const again = button("again", "Restart");
@@ -191,7 +193,7 @@ function open(root, board, code, tools) {
   const copy = button("copy", "Copy link");
   const share = make("div", { class: "share" }, link, copy);
   const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
-  root.replaceChildren(verdict, stage, bar, readout, share, panel, said);
+  root.replaceChildren(verdict, stage, bar, make("div", { class: "numbers" }, readout, values), share, panel, said);
   copy.disabled = watch.hidden = episodeLabel.hidden = true;
 
   const hands = new Hands(about, () => {
@@ -516,6 +518,7 @@ function open(root, board, code, tools) {
     setLink("");
     before = performance.now();
     label();
+    readOut(entries(ghostAt(0)));
     requestAnimationFrame(frame);
   }
 
@@ -561,12 +564,28 @@ function open(root, board, code, tools) {
     const moment = performance.now();
     if (running && moment - shownAt < 120) return;
     shownAt = moment;
-    readOut(ghostAt(part));
+    readOut(entries(ghostAt(part)));
   }
 
-  function readOut(beside) {
+  /** Write the numbers; while they change, paint them, for a browser lays out and paints text within milliseconds. */
+  function readOut(told) {
+    const { pen, width } = cleared(values);
+    if (!running || readout.children.length !== told.length) writeList(readout, told);
+    if (!running || !width) return;
+    writeList(spoken, told); // within the canvas, for those who do not see it
+    const { fontSize, fontFamily, color } = getComputedStyle(readout.lastChild.lastChild);
+    [pen.font, pen.fillStyle] = [`${fontSize} ${fontFamily}`, color];
+    told.forEach(([, value], i) => {
+      const place = readout.children[i].lastChild;
+      const { fontBoundingBoxAscent: above, fontBoundingBoxDescent: below } = pen.measureText(value);
+      pen.fillText(value, place.offsetLeft, place.offsetTop + (place.offsetHeight + above - below) / 2);
+    });
+  }
+
+  /** The names and values of the read-out. */
+  function entries(beside) {
     const score = known && (finished(me) ? text(scoreOf(me)) : !ended() && `${text(scoreOf(me))} so far`) || "–";
-    writeList(readout, [
+    return [
       ["Time", `${text(me.steps * about.dt, 2)} s`],
       ["Return", text(me.total, 2)],
       ...(ghost ? [["Ghost's return", beside ? text(beside.total, 2) : "–"]] : []),
@@ -576,7 +595,7 @@ function open(root, board, code, tools) {
         return [symbol(name), me.steps ? `${text(me.f[row], digits)} ${unit}`.trim() : "–"];
       }),
       ...board.state_names.map((name, i) => [symbol(name), `${text(me.f[i], 2)} ${board.state_units[i] ?? ""}`]),
-    ]);
+    ];
   }
 
   // --- sliders
