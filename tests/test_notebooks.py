@@ -48,16 +48,12 @@ def test_notebooks_lie_without_outputs(path):
     for cell in notebook.cells:
         assert not cell.get("outputs") and cell.get("execution_count") is None and not cell.metadata
         assert "http" not in cell.source.replace("https://github.com/lag-envs/lag-envs", "")
-        # Private names change without notice, and only the slow tests run every notebook.
+        # Private names change without notice.
         assert not re.search(r"\w\._[a-z]", cell.source), cell.source
     assert "pip install" in notebook.cells[0].source and "clone" in notebook.cells[0].source
 
 
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, marks=[] if p.stem == "first_steps" else pytest.mark.slow) for p in NOTEBOOKS],
-    ids=NAMES,
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
 def test_notebooks_run(path, tmp_path):
     """With few steps and episodes; in full under -m slow."""
     found = texts(run(path, tmp_path, LAG_ENVS_QUICK="1"))
