@@ -198,8 +198,8 @@ def explanation(env_id: str, source: str, problem: ValueIteration, grids: Sequen
         f"Finite-horizon value iteration on grids of {sizes} nodes with {problem.actions} actions, "
         "interpolated linearly; the step is the environment's own."
     )
-    if problem.pushes:
-        text += f" Expectation over kicks: {problem.pushes} sizes, equally likely."
+    if problem.kick_sizes:
+        text += f" Expectation over kicks: {problem.kick_sizes} sizes, equally likely."
     if problem.targets:
         text += (
             f" Solved for the targets {', '.join(f'{t:g}' for t in problem.targets)}; between them "

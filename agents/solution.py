@@ -117,7 +117,7 @@ class Solution:
         # The fingerprint does not cover the step between the points where it is evaluated.
         parameters = {
             "schema": CACHED, "env": self.env_id, "options": dict(problem.options), "target": target,
-            "level": self.level, "pushes": problem.pushes, "constants": self.task.formulas.constants(),
+            "level": self.level, "pushes": problem.kick_sizes, "constants": self.task.formulas.constants(),
         }  # fmt: skip
         formulas = self.task.formulas
         largest = formulas.largest
@@ -146,24 +146,24 @@ class Solution:
         chance, state = self.task.chance(self.problem.chance), np.array([self.task.centre])
         ends = (
             [self.model.kicked(state, [[share * chance], [0.9]]) for share in (1.0 - 1e-9, 1.0 + 1e-9)]
-            if self.task.draws == 2 and self.problem.pushes
+            if self.task.draws == 2 and self.problem.kick_sizes
             else []
         )
         if not ends or (ends[0] == ends[1]).all() or (ends[1] != state).any():
             raise ValueError(
                 f"value iteration would leave out the kicks of {self.env_id}: it takes those of two random "
                 "numbers, of which the first is below the chance of a kick and the second gives its size; "
-                "set `pushes` and `chance` in its ValueIteration"
+                "set `kick_sizes` and `chance` in its ValueIteration"
             )
         return True
 
     def _kick(self, points: Array) -> tuple[Array, Array]:
         """Return the outcomes of no kick and of kicks of all sizes, with their probabilities."""
-        states, pushes = self.states(points), self.problem.pushes
+        states, sizes = self.states(points), self.problem.kick_sizes
         chance = self.task.chance(self.problem.chance)
         # The first random number decides whether there is a kick, the second one its size.
-        draws = [(1.0 - 1e-9, 0.5), *((0.0, (i + 0.5) / pushes) for i in range(pushes))]
-        weights = np.array([1.0 - chance, *[chance / pushes] * pushes])
+        draws = [(1.0 - 1e-9, 0.5), *((0.0, (i + 0.5) / sizes) for i in range(sizes))]
+        weights = np.array([1.0 - chance, *[chance / sizes] * sizes])
         ones = np.ones(len(points))
         kicked = [self.model.kicked(states, np.array([a * ones, b * ones])) for a, b in draws]
         return np.stack(kicked)[:, :, self.keep], weights

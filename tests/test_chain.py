@@ -305,10 +305,10 @@ def test_mpc_begins_only_with_plans_of_its_task():
 def test_mpc_rescues_what_the_regulator_would_lose():
     task = chain.Balance()
     model, read = Model(without_kicks(task)), ObservationDecoder(task)
-    spread = np.random.default_rng(0).uniform(-1.0, 1.0, (16, 6)) * [0.1, 0.2, 0.12, 0.8, 0.12, 0.8]
+    offsets = np.random.default_rng(0).uniform(-1.0, 1.0, (16, 6)) * [0.1, 0.2, 0.12, 0.8, 0.12, 0.8]
     saved = {}
     for name in ("LQR", "MPC"):
-        agent, memory, states = build(task, name), None, task.examples.rest + spread
+        agent, memory, states = build(task, name), None, task.examples.rest + offsets
         alive = np.ones(len(states), np.bool_)
         for _ in range(60):
             actions, memory = agent.predict(read.expected(states)[0].astype(np.float32), memory)

@@ -190,18 +190,18 @@ class Twins(Scene):
 @pytest.fixture
 def rounds(monkeypatch):
     """Return a list of how many rows go backwards together, round by round."""
-    found, compile_pull_all = [], driver.compile_pull_all.__wrapped__
+    found, compile_vjp_all = [], driver.compile_vjp_all.__wrapped__
 
     def counting(*args):
-        pull = compile_pull_all(*args)
+        vjp = compile_vjp_all(*args)
 
-        def pull_all(given, *rest):
+        def vjp_all(given, *rest):
             found.append(given.shape[1])
-            pull(given, *rest)
+            vjp(given, *rest)
 
-        return pull_all
+        return vjp_all
 
-    monkeypatch.setattr(driver, "compile_pull_all", counting)
+    monkeypatch.setattr(driver, "compile_vjp_all", counting)
     return found
 
 

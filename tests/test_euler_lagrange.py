@@ -319,7 +319,7 @@ def test_normal_form_is_the_derived_equation(case):
             if form.angle is not None:
                 y += [mpmath.cos(y[form.angle]), mpmath.sin(y[form.angle])]
             u = [point.u[name] for name in form.layout.controls]
-            c = form.drive(y, u, k, mpmath)
+            c = form.coefficients_at(y, u, k, mpmath)
             q, v, *pair = form.unpack(y, u, k)
             assert abs(v - point.v[free]) < 1e-30 and q == point.q[free]
             if form.kind.__name__ == "Coefficients":

@@ -43,9 +43,9 @@ def test_errors_are_as_large_as_the_filter_believes():
     for t, _ in enumerate(rollout):
         if t in (5, 40, 120):
             known = rollout.memory
-            moved, spread = agent._move(known)  # from before the step to the present
+            moved, covariance = agent._move(known)  # from before the step to the present
             off = rollout.state - moved
-            weighed.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off).mean())
+            weighed.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off).mean())
         if t == 120:
             break
     # The mean of 200 has a standard deviation of √(2·4/200) = 0.2.

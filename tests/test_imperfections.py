@@ -276,14 +276,14 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
     shown = [env.reset(seed=seed)[0]]
     task, state = own.task, own.state
     formulas, k = task.formulas, task.formulas.constants()
-    spread, ages = (
+    delays, ages = (
         delay if isinstance(delay, tuple) else (delay, delay) for delay in (action_delay, observation_delay)
     )
     arrivals, pieces = [(0.0, 0.0)], []  # (when, which control); (when, state, control) of simulated pieces
     rng = np.random.default_rng(1)
     for n in range(60):
         action = rng.uniform(-1, 1, 1).astype(np.float32) if n % 3 else np.ones(1, np.float32)
-        late = spread[0] + (spread[1] - spread[0]) * draws(seed, 1, "delay", n, 1)[0]
+        late = delays[0] + (delays[1] - delays[0]) * draws(seed, 1, "delay", n, 1)[0]
         arrivals.append((n * dt + late, 5.0 * float(action[0])))
         observation, reward, *_ = env.step(action)
         shown.append(observation)

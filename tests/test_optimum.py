@@ -318,7 +318,7 @@ def test_listed_actions_are_tried(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("numbers", [{"pushes": 0}, {"chance": 0.02}])
+@pytest.mark.parametrize("numbers", [{"kick_sizes": 0}, {"chance": 0.02}])
 def test_kicks_are_not_left_out(numbers, monkeypatch):
     problem = dataclasses.replace(cylinder_in_cylinder.Damping.value_iteration, **numbers)
     with pytest.raises(ValueError, match="value iteration would leave out the kicks of Cylinder"):
@@ -591,7 +591,7 @@ def test_no_agent_is_above_what_is_published_of_the_optimum(env_id):
     """All were played from the same starts, so only kicks are luck."""
     for name, agent in summary(env_id).items():
         found = agent["conditions"]["nominal"]
-        luck = 3.0 * found["return_error"] if TASKS[env_id].value_iteration.pushes else 0.0
+        luck = 3.0 * found["return_error"] if TASKS[env_id].value_iteration.kick_sizes else 0.0
         mean = found["return"]
         assert mean <= highest(env_id) + luck, name
         assert mean <= numbers(env_id)["bound"]["value"]

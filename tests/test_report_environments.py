@@ -260,7 +260,7 @@ def test_undriven_pendulum(rows):
     assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["own"])
 
 
-def test_a_worse_stepper_breaks_the_claims(rows):
+def test_a_worse_integrator_breaks_the_claims(rows):
     """RK4, once per control step, in place of the shipped step."""
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)

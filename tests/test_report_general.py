@@ -72,7 +72,7 @@ def worst(rival, name, together=False):
 )
 @pytest.mark.parametrize("control", ["rate", slow("place"), slow("acceleration")])
 def test_what_moves_a_support(control, rivals):
-    """The exact end, and the steppers' equation, whether acceleration, rate or place is held."""
+    """The exact end, and the integrators' equation, whether acceleration, rate or place is held."""
     scene = Trolley(control=control)
     states = np.random.default_rng(1).uniform(-2, 2, (4, len(scene.state_names)))
     controls = np.random.default_rng(2).uniform(-2, 2, (4, 1))

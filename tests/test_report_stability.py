@@ -150,7 +150,7 @@ def test_amplification_of_an_upright_bar():
 
 
 def test_heavy_damping():
-    """At γ dt = 1e4 explicit Euler and RK4 diverge, lag_envs and the exponential stepper do not."""
+    """At γ dt = 1e4 explicit Euler and RK4 diverge, lag_envs and the exponential integrator do not."""
     (row,) = stability.map_errors("damping", "PivotedBar", 0.02, [1e4])
     errors = row["errors"]
     assert errors["explicit Euler"] == errors["RK4, 16"] == stability_results.DIVERGED

@@ -64,7 +64,7 @@ def test_order_of_convergence(method):
 @pytest.mark.parametrize("name", every(3, VARIANTS))
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_is_exact(name, mode):
-    """A regression of the shipped stepper's accuracy fails here."""
+    """A regression of the shipped integrator's accuracy fails here."""
     assert worst(ShippedStepping(), name, mode == "batch", count=12) < 1e-15
 
 
@@ -124,14 +124,14 @@ def test_kernels_refuse_other_constants():
         *((name, "DOP853, carried") for name in VARIANTS if name != "Incline, drag"),
     ],
 )  # fmt: skip
-def test_steppers_are_accurate(name, method, mode):
+def test_integrators_are_accurate(name, method, mode):
     assert method in CompiledMethod.methods(Problems(ensemble(name, 1)).equation)
     assert worst(CompiledMethod(method, 32), name, mode == "batch") < 1e-9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
-def test_all_steppers_are_accurate(name):
+def test_all_integrators_are_accurate(name):
     """In every form, and with the same bits in a batch as alone."""
     some = [t.case for t in truths(name, 6)]
     for method in CompiledMethod.methods(Problems(some).equation):
@@ -146,7 +146,7 @@ def test_all_steppers_are_accurate(name):
 
 @pytest.mark.parametrize("name", ["PivotedBar", "CylinderInCylinder, tilt", "Incline, moving"])
 def test_held_controls_are_one_call(name):
-    """Over many control steps a stepper takes substeps, or one step for several."""
+    """Over many control steps an integrator takes substeps, or one step for several."""
     fine, coarse = (worst(CompiledMethod("DOP853, carried", n), name, True, 40) for n in (4, 1 / 4))
     assert fine < 1e-12 and coarse < 1e-2
     assert CompiledMethod("RK4", 1 / 4).substeps(40) == 10
@@ -177,7 +177,7 @@ def test_heyokas_own_step_is_what_is_timed(mode, monkeypatch):
     pytest.importorskip("heyoka")
     problems, ends = Problems(ensemble("CylinderInCylinder, tilt", 19)), []
     ends.append(peers.Heyoka("Taylor", 1e-10).build(problems, 0.05, 1, mode == "batch").end())
-    monkeypatch.setattr(peers, "_stepper", lambda integrator: None)
+    monkeypatch.setattr(peers, "_compiled_step", lambda integrator: None)
     ends.append(peers.Heyoka("Taylor", 1e-10).build(problems, 0.05, 1, mode == "batch").end())
     assert np.array_equal(*ends)
 

@@ -66,13 +66,13 @@ def coefficients(scene):
 
 def operations(scene):
     """Return the number of operations of an ordinary step."""
-    return form_of(scene).stepper(0.02, absent_from(motion_constants_of(scene))).operations
+    return form_of(scene).code(0.02, absent_from(motion_constants_of(scene))).operations
 
 
 def advance_of(scene, dt):
     """Return the scene's compiled step, and its arguments after state, control and step."""
     numbers = motion_constants_of(scene)
-    code = form_of(scene).stepper(dt, absent_from(numbers))
+    code = form_of(scene).code(dt, absent_from(numbers))
     return code.compile(), [form_of(scene).largest_majorant(dt), *(v for v in numbers.values() if v)]
 
 

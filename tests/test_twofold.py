@@ -17,9 +17,9 @@ def exact(number):
     return Fraction(number.high) + Fraction(number.low)
 
 
-def random_floats(n, seed, spread=8):
+def random_floats(n, seed, decades=8):
     rng = np.random.default_rng(seed)
-    return (rng.uniform(-1.0, 1.0, n) * 10.0 ** rng.uniform(-spread, spread, n)).tolist()
+    return (rng.uniform(-1.0, 1.0, n) * 10.0 ** rng.uniform(-decades, decades, n)).tolist()
 
 
 def test_error_free_transformations():
@@ -74,8 +74,8 @@ def compiled():
 def test_twice_the_digits(compiled):
     """Sums, products and constants such as 1/3, in Python and compiled, with the same bits."""
     for i in range(200):
-        high = random_floats(4, 100 + i, spread=3)
-        low = [h * e * 2.0**-54 for h, e in zip(high, random_floats(4, 500 + i, spread=0), strict=True)]
+        high = random_floats(4, 100 + i, decades=3)
+        low = [h * e * 2.0**-54 for h, e in zip(high, random_floats(4, 500 + i, decades=0), strict=True)]
         numbers = [x for pair in zip(high, low, strict=True) for x in pair]
         parts = formula(None, *numbers)
         results = compiled(*numbers)

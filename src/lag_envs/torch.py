@@ -479,7 +479,7 @@ class _RowStepBackward(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         given = states, actions, targets
         y, a, g, z, *seeds = map(_numbers, (*given, ends, by_states, by_observations, by_rewards))
-        slopes = model.reverse().pull(y, a, g, z, z, *seeds)
+        slopes = model.reverse().vjp(y, a, g, z, z, *seeds)
         return tuple(
             torch.from_numpy(np.ascontiguousarray(slope)).to(x.dtype)
             for slope, x in zip(slopes, given, strict=False)
@@ -546,7 +546,7 @@ class _EnvStep(torch.autograd.Function):
             ends = _replaced(ends, begun, model(y[begun], actions, ctx.targets[begun] if random else None)[0])
             after = after if task.draws else ends
         g = np.zeros((len(y), 0)) if ctx.targets is None else ctx.targets.reshape(len(y), -1)
-        by_state, by_action, _, _ = model.reverse().pull(
+        by_state, by_action, _, _ = model.reverse().vjp(
             y, a, g, ends, after, by_states, by_observations, by_rewards
         )
         by_state[waiting] = by_action[waiting] = 0.0

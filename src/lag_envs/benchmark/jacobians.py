@@ -178,7 +178,7 @@ def _backwards(name: str, rounds: int, clock: Callable[[], float], count: int) -
 
     def back() -> None:
         for i, action in enumerate(actions):
-            reverse.pull(states[i], action, targets, states[i + 1], states[i + 1], *seeds)
+            reverse.vjp(states[i], action, targets, states[i + 1], states[i + 1], *seeds)
 
     # Both start from the same states, since these determine how a step is divided.
     times = _least((step, back), rounds, clock, before=lambda: envs.reset(seed=0))

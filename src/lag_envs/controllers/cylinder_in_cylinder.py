@@ -54,11 +54,11 @@ class TiltLQR(FeedbackController):
             raise ValueError("without drag no rate of the shell holds the cylinder, got damping=0 N m s")
         self.gain, _ = regulator(task, [0.0, 0.0, 0.0], extra={"u": effort / task.limit_control**2})
         #: At rest -alpha sinθ + gamma ψ' = 0.
-        self.drive = task.coefficients([0.0, 0.0, 0.0], [0.0], np)
+        self.coeffs = task.coefficients([0.0, 0.0, 0.0], [0.0], np)
 
     def holding_rate(self, theta: Array) -> Array:
         """Return the shell's rate that holds the cylinder at an angle [rad/s]."""
-        return self.drive.alpha / self.drive.gamma * np.sin(theta)
+        return self.coeffs.alpha / self.coeffs.gamma * np.sin(theta)
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the shell's acceleration."""
@@ -69,7 +69,7 @@ class TiltLQR(FeedbackController):
 class EnergyPump(FeedbackController):
     """Pump the swing to the wanted energy, and compensate for the drag.
 
-    Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes at the rate θ' (push u - drag (θ' - ψ')),
+    Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes at the rate θ' (gain u - drag (θ' - ψ')),
     so one value of the control keeps the energy constant, and an addition in the direction of θ' raises it.
     The shell is drawn back to rest.
 
@@ -91,8 +91,8 @@ class EnergyPump(FeedbackController):
                 "turning the shell does not push a cylinder without inertia, got inertia=0 kg m²"
             )
         self.pump, self.centring = pump, centring
-        drive = task.coefficients([0.0, 0.0, 0.0], [1.0], np)
-        self.omega0_squared, self.damping_rate, self.push = drive.alpha, drive.gamma, drive.delta
+        coeffs = task.coefficients([0.0, 0.0, 0.0], [1.0], np)
+        self.omega0_squared, self.damping_rate, self.gain = coeffs.alpha, coeffs.gamma, coeffs.delta
         self.wanted = task.energies([0.0, 0.0, 0.0], np)[1]
 
     def control(self, state: Array, target: Array) -> Array:
@@ -100,7 +100,7 @@ class EnergyPump(FeedbackController):
         theta, theta_dot, psi_dot = np.moveaxis(state, -1, 0)
         energy = 0.5 * theta_dot**2 + self.omega0_squared * (1.0 - np.cos(theta))
         missing = 1.0 - energy / self.wanted
-        keeping = self.damping_rate / self.push * (theta_dot - psi_dot)
+        keeping = self.damping_rate / self.gain * (theta_dot - psi_dot)
         pumping = self.pump * self.task.limit_control * missing * theta_dot / np.sqrt(2.0 * self.wanted)
         return keeping + pumping - self.centring * psi_dot
 

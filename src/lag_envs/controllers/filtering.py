@@ -98,10 +98,10 @@ class Filtered:
         covariance = np.tile(self.prior, (len(batch), 1, 1))
         fresh, memory = beginning(len(batch), state, episode_start), None
         if state is not None:
-            moved, spread = self._move(state)
+            moved, uncertain = self._move(state)
             x, covariance = (
                 np.where(fresh[:, None], x, moved),
-                np.where(fresh[:, None, None], covariance, spread),
+                np.where(fresh[:, None, None], covariance, uncertain),
             )
             memory = state.memory
         x, covariance = self._see(x, covariance, batch)
@@ -117,8 +117,8 @@ class Filtered:
         applied = self.task.formulas.control(np, [known.action], lifted, [], self._k)
         controls = np.stack(np.broadcast_arrays(*applied), axis=-1)
         slopes, _ = self.task.scene.jacobian(x, controls, self.task.dt)
-        spread = slopes @ known.covariance @ slopes.transpose(0, 2, 1) + self.drift
-        return self.model(x, known.action)[0], spread
+        covariance = slopes @ known.covariance @ slopes.transpose(0, 2, 1) + self.drift
+        return self.model(x, known.action)[0], covariance
 
     def _see(self, x: Array, covariance: Array, observation: Array) -> tuple[Array, Array]:
         """Return estimate and covariance after an observation."""

@@ -253,7 +253,7 @@ class Model:
             "by_observations": _rows("by_observations", by_observations, (n, observations)),
             "by_rewards": _rows("by_rewards", by_rewards, (n,)),
         }
-        slopes = reverse.pull(states, actions, targets, ends, kicked, *seeds.values())
+        slopes = reverse.vjp(states, actions, targets, ends, kicked, *seeds.values())
         if not all(np.isfinite(x).all() for x in slopes):
             row = int(np.argmin(np.isfinite(np.concatenate(slopes, axis=1)).all(axis=1)))
             given = ", ".join(f"{name}={x[row].tolist()}" for name, x in seeds.items())

@@ -108,17 +108,17 @@ class Program:
         check_draws(task)
         names = names or list(formulas.constants())
         constants = {name: 0.0 if name in absent else f"k_{name}" for name in names}
-        self._stepper = self._step_code(formulas, absent, constants)
+        self._code = self._step_code(formulas, absent, constants)
         #: Whether steps use the general series, block by block, instead of a flow, lane by lane.
-        self.general = not hasattr(self._stepper, "fast")
-        self.y, self.z = self._stepper.start, self._stepper.end
+        self.general = not hasattr(self._code, "fast")
+        self.y, self.z = self._code.start, self._code.end
         self.o = [f"o{i}" for i in range(len(formulas.observation))]
         self.a = [f"a{i}" for i in range(formulas.actions)]
         self.u = [f"u{i}" for i in range(formulas.controls)]
         self.g = [f"g{i}" for i in range(formulas.targets)]
         self._record(formulas, constants)
         lines = " ".join(self._printed)
-        used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", lines)}
+        used = {"k_limit", "k_dt", *self._code.constants, *re.findall(r"\bk_\w+", lines)}
         #: Names of the constants that are carried: those that are used and not zero.
         self.constants = [name for name in names if f"k_{name}" in used]
         self.uniform = [name for name in self.constants if name not in varying]
@@ -126,7 +126,7 @@ class Program:
         #: Names of the rows that are kept from step to step, and of those needed within one. The rows of the
         #: series come first, one after the other.
         self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying), *self.own]
-        self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
+        self.flow = [f"flow_{name}" for name in self._code.rows] if self.general else []
         self.held = [f"held{i}" for i in range(len(self.u))]
         self.scratch = [
             *self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held, *self.reaching,
@@ -135,7 +135,7 @@ class Program:
 
     def _step_code(self, formulas: Any, absent: frozenset[str], constants: dict[str, Any]) -> Any:
         """Return the code of a step of the scene."""
-        return formulas.stepper(absent)
+        return formulas.step_code(absent)
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         width, actions, controls, targets = len(self.y), len(self.a), len(self.u), len(self.g)
@@ -181,7 +181,7 @@ class Program:
         ]
         self.control = self.clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
         step = [*self.u, *self.g, *self.y, *self.z, *given]
-        self.fast = [f"dt = {constants['dt']}", *([] if self.general else self._stepper.fast)]
+        self.fast = [f"dt = {constants['dt']}", *([] if self.general else self._code.fast)]
         #: Closed forms do not need it.
         self._x = constants["x"] if formulas.bounded else 0.0
         if formulas.bounded:
@@ -223,14 +223,14 @@ class Program:
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
             *self._command_one, *self._move_one, *self._finish_one(),
         ]  # fmt: skip
-        helpers = [self._stepper.engine()] if self.tries_all else []
+        helpers = [self._code.engine()] if self.tries_all else []
         return compile_lines("step_one", "f, obs, a, ids", body, *helpers)
 
     @property
     def _move_one(self) -> list[str]:
         """The lines from the command and ``y`` to ``z``, with the controls of the reward in ``u``."""
         if self.general:
-            move = [self._room_one, *self._stepper.any_step, "if status < 0:"]
+            move = [self._room_one, *self._code.any_step, "if status < 0:"]
         else:
             move = ["if not within:"]
         return [
@@ -285,13 +285,13 @@ class Program:
 
     @cached_property
     def advance(self) -> Callable:
-        """The scalar function for any step; see `Stepper.compile` and `StepCode.compile`."""
-        return self._stepper.compile()
+        """The scalar function for any step; see `FlowCode.compile` and `SeriesCode.compile`."""
+        return self._code.compile()
 
     @property
     def advance_constants(self) -> list[str]:
         """Names of the constants that `advance` takes after ``y..., u..., dt, x``."""
-        return [name.removeprefix("k_") for name in self._stepper.constants]
+        return [name.removeprefix("k_") for name in self._code.constants]
 
     @cached_property
     def model(self) -> Callable:
@@ -300,7 +300,7 @@ class Program:
         Returns 0, or i + 1 if the step of row i was refused.
         """
         n = self.n_state
-        step = [*self._stepper.any_step, "if status < 0:", "    return i + 1"]
+        step = [*self._code.any_step, "if status < 0:", "    return i + 1"]
         slow = ["if not within:", f"    x = {self._x}", *indent(step)]
         row = [
             *(f"y{j} = states[i, {j}]" for j in range(n)), *self.lift,
@@ -314,17 +314,17 @@ class Program:
         ]  # fmt: skip
         body = [
             *self._parameters(),
-            *([f"rows = np.zeros({self._stepper.scratch})"] if self.general else []),
+            *([f"rows = np.zeros({self._code.scratch})"] if self.general else []),
             "for i in range(states.shape[0]):", *indent(row),
             "return 0",
         ]  # fmt: skip
         arguments = "states, actions, targets, par, ends, rewards, ended"
-        return compile_lines("model", arguments, body, self._stepper.engine())
+        return compile_lines("model", arguments, body, self._code.engine())
 
     @property
     def room(self) -> int:
         """Numbers that `step_one` needs after the constants."""
-        return self._stepper.scratch if self.general else 0
+        return self._code.scratch if self.general else 0
 
     @property
     def room_of_all(self) -> int:
@@ -481,7 +481,7 @@ class Program:
                 *self._show_block,
             ]),
         ]  # fmt: skip
-        engine = self._stepper.compile_block if self.general else self._stepper.engine
+        engine = self._code.compile_block if self.general else self._code.engine
         return compile_lines(
             "step_blocks", sharing.STEP_BLOCKS, body, engine(), *sharing.claiming(), inner=True
         )
@@ -504,20 +504,20 @@ class Program:
     @property
     def _flow(self) -> dict[str, str]:
         """The rows of the general series, by their names in its code."""
-        return dict(zip(self._stepper.rows, self.flow, strict=True))
+        return dict(zip(self._code.rows, self.flow, strict=True))
 
     def _advance_lanes(self, before: Sequence[str]) -> list[str]:
         """Return the loop that fills in rows for the general series, and the call that moves the block."""
-        given = self._stepper.given
-        store = [*self._stepper.prepare, *self._store([self._flow[name] for name in given], given)]
+        given = self._code.given
+        store = [*self._code.prepare, *self._store([self._flow[name] for name in given], given)]
         call = f"advance_block(par, np.int64({len(self.uniform)}), size, np.int64({self._x}))"
         return [*indented(EACH_LANE, [*before, *store]), call]
 
     @property
     def _advanced(self) -> list[str]:
         """The lines that load what the general series made of it."""
-        results = self._stepper.results
-        return [*self._load([self._flow[name] for name in results], results), *self._stepper.finish]
+        results = self._code.results
+        return [*self._load([self._flow[name] for name in results], results), *self._code.finish]
 
     @property
     def _move_lanes(self) -> list[str]:
@@ -542,7 +542,7 @@ class Program:
     def _to_end_again(self) -> list[str]:
         """The same with the commands stored, for any step of a single lane."""
         if not self.general:
-            return [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._stepper.any_step]
+            return [*self._load(self.u), f"dt, x = k_dt, {self._x}", *self._code.any_step]
         return [
             *self._load(self._commands, self.u), *self._in_force, *self.fast, *self._advanced, *self._average,
         ]  # fmt: skip

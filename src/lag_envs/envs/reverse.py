@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.derivation import code_of, form_of
-from lag_envs.scenes.steps import check_turns, pulled
+from lag_envs.scenes.steps import check_turns, vjp_of_rows
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.normal_forms import lifted
@@ -72,7 +72,7 @@ class Reverse:
         """Return the observations of states (n, n_state) with targets (n, n_targets)."""
         return self._lanes("observe", self._observe_of, "y", "g")(self._numbers, states, targets)[0]
 
-    def pull(
+    def vjp(
         self,
         states: Array,
         actions: Array,
@@ -124,7 +124,7 @@ class Reverse:
     def _in_parts(
         self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> None:
-        """Do the same as `pull`, into `out`, with the motion as a part of its own; errors name `rows`."""
+        """Do the same as `vjp`, into `out`, with the motion as a part of its own; errors name `rows`."""
         results = self._after(kicked)(self._numbers, y, a, g, z, *rest)
         last = np.flatnonzero(results[-1][:, 0] != 0.0)
         if len(last):
@@ -132,7 +132,7 @@ class Reverse:
             for x, some in zip(results, self._after(kicked, last=True)(self._numbers, *given), strict=True):
                 x[last] = some
         u, own_y, own_z, *own, _ = results
-        moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
+        moved = vjp_of_rows(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
         before = self._lanes(
             "before", self._before_of, "y", "a", "g", "own_y", "own_u", "own_g", "own_p", "moved"
         )
@@ -229,10 +229,10 @@ class Reverse:
 
         The last result is 1 where the whole record is valid: the step is ordinary, and the episode goes on.
         """
-        stepper: Any = code_of(self._task.scene, self._task.dt)
+        code: Any = code_of(self._task.scene, self._task.dt)
         after = self._after_of(kicked, False, xp, k, y=y, a=a, g=g, **rest)
         u, own_y, own_z, own_u, own_g, _, (ended,) = after
-        moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
+        moved, ordinary = code.record_vjp(xp, y, u, k, own_z, [*y, *u])
         own = {"own_y": own_y, "own_u": own_u, "own_g": own_g, "own_p": []}
         by = self._before_of(xp, k, y, a, g, moved=moved, **own)
         return [*by, [xp.where(ordinary, 1.0, 0.0) - ended]]

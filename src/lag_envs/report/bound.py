@@ -86,20 +86,20 @@ class Driven(Scene):
         return {"theta": self.delta + v.turn}
 
 
-def driven(drive: Coefficients) -> tuple[Scene, list[float]]:
-    """Return the scene of a drive, and its control."""
-    alpha, beta, gamma, delta, ramp = map(float, drive)
+def driven(coeffs: Coefficients) -> tuple[Scene, list[float]]:
+    """Return a scene with these coefficients, and its control."""
+    alpha, beta, gamma, delta, ramp = map(float, coeffs)
     return Driven(alpha=alpha, beta=beta, gamma=gamma, delta=delta), [ramp]
 
 
 def truncation(
-    theta: float, omega: float, drive: Coefficients, h: float, order: int, digits: int = DIGITS
+    theta: float, omega: float, coeffs: Coefficients, h: float, order: int, digits: int = DIGITS
 ) -> tuple[float, float]:
     """Return the truncation errors of a step of the series in θ [rad], θ' [rad/s]; infinite if it diverges.
 
     The errors are the sums of the oracle's next `MORE` coefficients beyond the order.
     """
-    scene, control = driven(drive)
+    scene, control = driven(coeffs)
     state = [0.0, 0.0, theta, omega]
     found = oracle_of(scene).coefficients(state, control, h, order + 2 + MORE, digits)
     with mp.workdps(digits):
@@ -112,7 +112,7 @@ def truncation(
 
 
 def random_problem(rng: np.random.Generator) -> tuple[float, float, Coefficients]:
-    """Return θ, θ' and a drive, from calm to violent; each term is present with probability 4/5."""
+    """Return θ, θ' and coefficients, from calm to violent; each term is present with probability 4/5."""
     exponents = rng.uniform([-1, -1, -2, -1, -1], [3, 3, 2, 3, 4])
     sizes = 10.0**exponents * rng.uniform(-1, 1, 5) * (rng.random(5) < 0.8)
     sizes[2] = abs(sizes[2])
@@ -120,12 +120,12 @@ def random_problem(rng: np.random.Generator) -> tuple[float, float, Coefficients
     return float(rng.uniform(-4, 4)), float(omega), Coefficients(*map(float, sizes))
 
 
-def step_at(omega: float, drive: Coefficients, x: float) -> float:
+def step_at(omega: float, coeffs: Coefficients, x: float) -> float:
     """Return the longest step [s] that is certified with this x."""
     low, high = -40.0, 5.0
     for _ in range(60):
         middle = 0.5 * (low + high)
-        good = pendulum.certified(omega, drive, math.exp(middle), x, np)
+        good = pendulum.certified(omega, coeffs, math.exp(middle), x, np)
         low, high = (middle, high) if good else (low, middle)
     return math.exp(low)
 
@@ -140,13 +140,13 @@ def bound_points(n: int, seed: int) -> Iterator[Row]:
     """Yield the bound and the truncation error of one step, at every order, for n random drives."""
     for i in range(n):
         rng = np.random.default_rng([seed, i])
-        theta, omega, drive = random_problem(rng)
+        theta, omega, coeffs = random_problem(rng)
         x = float(0.02 * 25.0 ** rng.uniform())
-        h = step_at(omega, drive, x)
+        h = step_at(omega, coeffs, x)
         for order in ORDERS:
-            bounds, actual = majorant(x, h, order), truncation(theta, omega, drive, h, order)
+            bounds, actual = majorant(x, h, order), truncation(theta, omega, coeffs, h, order)
             row = {"kind": "point", "order": order, "x": x, "h": h, "theta_0": theta, "omega_0": omega}
-            row |= {"drive": list(drive), "theta_bound": bounds[0], "theta": actual[0]}
+            row |= {"drive": list(coeffs), "theta_bound": bounds[0], "theta": actual[0]}
             yield row | {"theta_dot_bound": bounds[1], "theta_dot": actual[1]}
 
 
@@ -154,31 +154,31 @@ def substeps_needed(n: int, seed: int) -> Iterator[Row]:
     """Yield, for steps of any length, the substeps that the bound requires and the fewest that suffice."""
     for i in range(n):
         rng = np.random.default_rng([9, seed, i])
-        theta, omega, drive = random_problem(rng)
-        h = step_at(omega, drive, float(0.1 * 40.0 ** rng.uniform()))
-        while (chosen := pendulum.truncation_bound(omega, drive, h).substeps) > MOST_SUBSTEPS:
+        theta, omega, coeffs = random_problem(rng)
+        h = step_at(omega, coeffs, float(0.1 * 40.0 ** rng.uniform()))
+        while (chosen := pendulum.truncation_bound(omega, coeffs, h).substeps) > MOST_SUBSTEPS:
             h /= 2.0
-        scene, control = driven(drive)
+        scene, control = driven(coeffs)
         exact = reference.exact_flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
-        field = math.sqrt(math.hypot(drive.alpha, drive.beta))
+        field = math.sqrt(math.hypot(coeffs.alpha, coeffs.beta))
         limits = (
             TOLERANCE * max(1.0, abs(theta), abs(omega) * h),
             TOLERANCE * max(1.0, abs(omega), field),
         )
-        low, needed = 0, chosen if _enough(theta, omega, drive, h, chosen, exact, limits) else None
+        low, needed = 0, chosen if _enough(theta, omega, coeffs, h, chosen, exact, limits) else None
         while needed and needed - low > 1:
             middle = (low + needed) // 2
-            if _enough(theta, omega, drive, h, middle, exact, limits):
+            if _enough(theta, omega, coeffs, h, middle, exact, limits):
                 needed = middle
             else:
                 low = middle
-        yield {"kind": "cost", "h": h, "chosen": chosen, "needed": needed, "drive": list(drive)}
+        yield {"kind": "cost", "h": h, "chosen": chosen, "needed": needed, "drive": list(coeffs)}
 
 
 def _enough(
     theta: float,
     omega: float,
-    drive: Coefficients,
+    coeffs: Coefficients,
     dt: float,
     n: int,
     exact: Sequence[mpf],
@@ -189,7 +189,7 @@ def _enough(
     y: Any = theta, omega, math.cos(theta), math.sin(theta)
     for i in range(n):
         theta, omega, c, s = y
-        y = pendulum.step(theta, omega, c, s, drive._replace(delta=drive.delta + drive.ramp * (i * h)), h)
+        y = pendulum.step(theta, omega, c, s, coeffs._replace(delta=coeffs.delta + coeffs.ramp * (i * h)), h)
     return all(abs(e) <= m for e, m in zip(reference.state_differences(y[:2], exact), limits, strict=True))
 
 
@@ -213,8 +213,8 @@ def environment(id: str, n: int) -> Iterator[Row]:
         return entries
 
     def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
-        drive = Coefficients(*map(float, stepped.at(state(theta, speed), u)[1]))
-        return truncation(theta, speed, drive, dt, stepped.flow.order, digits)
+        coeffs = Coefficients(*map(float, stepped.at(state(theta, speed), u)[1]))
+        return truncation(theta, speed, coeffs, dt, stepped.flow.order, digits)
 
     for _ in range(n):
         theta, speed, u = (float(v) for v in rng.uniform([-math.pi, -reach, low], [math.pi, reach, high]))

@@ -97,8 +97,8 @@ def closed_form_flow(
     with mp.workdps(digits + 40):
         t = mpf(dt)
         q, v = oracle.start([mpf(x) for x in state], [mpf(u) for u in controls], mpf)
-        for name, (_, _, push) in oracle.driven(q, v, [mpf(u) for u in controls], mpf(0)).items():
-            q[name], v[name] = q[name] + t * (v[name] + t * push / 2), v[name] + t * push
+        for name, (_, _, acceleration) in oracle.driven(q, v, [mpf(u) for u in controls], mpf(0)).items():
+            q[name], v[name] = q[name] + t * (v[name] + t * acceleration / 2), v[name] + t * acceleration
         (free,), (alpha, beta) = oracle.names.free, (mpf(int(x.p)) / int(x.q) for x in coefficients)
         q[free], v[free] = elliptic(alpha, beta, q[free], v[free], t)
         return [(q if kind == "place" else v)[name] for name, kind in oracle.names.state]

@@ -104,7 +104,7 @@ def compile_march(scene: Stepped) -> Callable:
     Row j of `out` is the lifted state after ``marks[j]`` steps, and row -1 the start. The function returns
     the number of filled rows.
     """
-    code = scene.stepper()
+    code = scene.code()
     width = len(code.start)
     lines = [
         f"{', '.join(code.start)}, = {', '.join(f'out[-1, {i}]' for i in range(width))},",

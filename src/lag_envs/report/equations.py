@@ -43,7 +43,7 @@ class Equation(ABC):
     def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
         """Return y'; if `y` is lifted, no function of `xp` is called."""
 
-    def stepper(self, method: str, carried: bool) -> Callable:
+    def step_of(self, method: str, carried: bool) -> Callable:
         """Return ``step(y, p, t, h, xp)`` of one of `METHODS`.
 
         The step takes and returns lifted unknowns; if cosines and sines are not carried, they are left
@@ -102,7 +102,7 @@ class NormalFormEquation(Equation):
         """Return (q', v'), and the rates of cosine and sine if these are among the unknowns."""
         return EQUATIONS[self.kind].rate(self.coefficients(p), t, y, xp, p[-1])
 
-    def stepper(self, method: str, carried: bool) -> Callable:
+    def step_of(self, method: str, carried: bool) -> Callable:
         """Return any of `METHODS`; all of them take the flow's variables."""
         equation = EQUATIONS[self.kind]
         step = comparison(method, equation.flow, carried).fast
@@ -131,9 +131,8 @@ class Problems:
         states = np.array([case.state for case in self.cases])
         self._lifted = scene.lift(states)
         flow = scene.flow
-        coefficients = np.array([
-            np.broadcast_to(x, self._u.shape) for x in scene.drive(self._lifted, self._u, self._k, np)
-        ])  # fmt: skip
+        given = scene.coefficients_at(self._lifted, self._u, self._k, np)
+        coefficients = np.array([np.broadcast_to(x, self._u.shape) for x in given])
         present = tuple(bool(row.any()) for row in coefficients)
         #: The equation to solve.
         self.equation: Equation = NormalFormEquation(flow.coefficients, present)

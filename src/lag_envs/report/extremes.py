@@ -172,8 +172,8 @@ def _floor(case: Case, entry: int) -> float:
     if scene.state_units[entry] == "rad":
         return 1.0
     if scene.state_names[entry] == "theta_dot":
-        _, drive = Stepped(scene).at(state, control)
-        return math.sqrt(math.hypot(drive[0], drive[1]))
+        _, coeffs = Stepped(scene).at(state, control)
+        return math.sqrt(math.hypot(coeffs[0], coeffs[1]))
     return 0.0
 
 
@@ -182,7 +182,7 @@ def substeps(case: Case, dt: float) -> int:
     scene, state, control = case
     stepped = Stepped(scene, dt=dt)
     y = map(float, stepped.lift(np.asarray(state, dtype=np.float64)))
-    advance = stepped.stepper().compile()
+    advance = stepped.code().compile()
     *_, status = advance(*y, control, dt, stepped.largest_majorant(dt), *stepped.present())
     return int(status)
 

@@ -85,12 +85,12 @@ class PendulumEquation(FlowEquation):
         """Return the rates."""
         q, v, *pair = y
         c, s = pair or (xp.cos(q), xp.sin(q))
-        push = pendulum.acceleration(v, c, s, k) + k.ramp * t
-        return (v, push, -(v * s), v * c) if pair else (v, push)
+        acceleration = pendulum.acceleration(v, c, s, k) + k.ramp * t
+        return (v, acceleration, -(v * s), v * c) if pair else (v, acceleration)
 
     def problem(self, k: Any, variables: Sequence, xp: Any, carried: bool) -> Problem:
         """Return the equation of motion."""
-        push = k._replace(gamma=0.0)
+        undamped = k._replace(gamma=0.0)
         turn = pendulum.Coefficients(k.alpha, k.beta)
         start, *pair = variables[0], *variables[2:]
 
@@ -101,7 +101,7 @@ class PendulumEquation(FlowEquation):
 
         def force(q: Any, t: Any) -> Any:
             c, s = cos_sin(q)
-            return pendulum.acceleration(0.0, c, s, push) + k.ramp * t
+            return pendulum.acceleration(0.0, c, s, undamped) + k.ramp * t
 
         def gradient(q: Any, t: Any) -> Any:
             c, s = cos_sin(q)

@@ -107,24 +107,24 @@ def radau(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
     twice = [[sum(a[i][k] * a[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
     c = [sum(row) for row in a]
     hh = h * h
-    pushed = [p.acceleration(q, v, 0.0)] * 3
+    accelerations = [p.acceleration(q, v, 0.0)] * 3
 
     def speed(row: Sequence[float]) -> Any:
-        return v + h * sum_of_products(list(zip(row, pushed, strict=True)))
+        return v + h * sum_of_products(list(zip(row, accelerations, strict=True)))
 
     def place(i: int) -> Any:
-        return q + (h * c[i]) * v + hh * sum_of_products(list(zip(twice[i], pushed, strict=True)))
+        return q + (h * c[i]) * v + hh * sum_of_products(list(zip(twice[i], accelerations, strict=True)))
 
     for _ in range(1 if p.linear else 4):
         places = [place(i) for i in range(3)]
         rows = []
         for i in range(3):
             slope_at = p.gradient(places[i], h * c[i])
-            wrong = p.force(places[i], h * c[i]) - p.damping_rate * speed(a[i]) - pushed[i]
+            wrong = p.force(places[i], h * c[i]) - p.damping_rate * speed(a[i]) - accelerations[i]
             matrix = [p.damping_rate * (h * a[i][j]) - slope_at * (hh * twice[i][j]) for j in range(3)]
             matrix[i] = 1.0 + matrix[i]
             rows.append([*matrix, wrong])
-        pushed = [x + dx for x, dx in zip(pushed, _solve(rows), strict=True)]
+        accelerations = [x + dx for x, dx in zip(accelerations, _solve(rows), strict=True)]
     return place(2), speed(a[2])
 
 

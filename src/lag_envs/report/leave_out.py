@@ -107,7 +107,7 @@ def carried_numbers(task: Task) -> Row:
     absent = absent_from(numbers)
     program = Program(task, absent)
     stepped = Stepped(scene, dt=task.dt)
-    code = stepped.stepper()
+    code = stepped.code()
     lines = [*program.control, *program.fast, *program.outcome, *program.last, *program.kick, *program.move]
     lines += program.observe
     ends = [*program.moved, "r", "over", "within", *program.o]
@@ -168,7 +168,7 @@ def savings(count: int, rounds: int) -> Iterator[Row]:
             samples.append(at_once(FlowSteps(scene, stepped.flow), cases, 8, pair.dt))
     times = interleaved(samples, rounds)
     for i, pair in enumerate(PAIRS[:count]):
-        operations = [stepped.stepper().operations for stepped in pair.stepped()]
+        operations = [stepped.code().operations for stepped in pair.stepped()]
         yield {
             "kind": "savings", "left_out": pair.left_out, "operations": operations,
             "ns": times[2 * i : 2 * i + 2],

@@ -87,11 +87,11 @@ class SceneEquation(Equation):
         for moved in layout.at("acceleration", "rate"):
             held = given.get(moved.control, 0.0)
             if moved.level == "acceleration":
-                rate, push = given.get(f"{moved.name}_dot", 0.0), held
+                rate, acceleration = given.get(f"{moved.name}_dot", 0.0), held
             else:
-                rate, push = held, 0.0
-            values[place(moved.name)] = given.get(moved.name, 0.0) + t * (rate + t * (0.5 * push))
-            values[velocity(moved.name)] = rate + t * push
+                rate, acceleration = held, 0.0
+            values[place(moved.name)] = given.get(moved.name, 0.0) + t * (rate + t * (0.5 * acceleration))
+            values[velocity(moved.name)] = rate + t * acceleration
         mass, force = self._motion
         found = evaluate([*mass, *force], values, xp)
         rows = [found[i * n : (i + 1) * n] for i in range(n)]
@@ -147,9 +147,9 @@ class SceneProblems(Problems):
         v = self._v | dict(zip(layout.free, y[n : 2 * n], strict=True))
         held = dict(zip(layout.controls, self.controls.T, strict=True))
         for p in layout.at("acceleration", "rate"):
-            push = held[p.control] if p.level == "acceleration" else 0.0
-            q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * push))
-            v[p.name] = v[p.name] + span * push
+            acceleration = held[p.control] if p.level == "acceleration" else 0.0
+            q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * acceleration))
+            v[p.name] = v[p.name] + span * acceleration
         v = self._shifted(q, v, 1.0)
         return np.stack([(q if e.kind == "place" else v)[e.coordinate] for e in layout.state], axis=1)
 
@@ -219,7 +219,7 @@ def _alone(code: Any, tolerance: float) -> Callable:
 def _batch(code: Any, tolerance: float) -> Callable:
     """Compile ``batch(memory, count, dt, order, constants...)``: a control step of all lanes, block by block.
 
-    A block has rows for state and controls, then those of `StepCode.rows`, and one more.
+    A block has rows for state and controls, then those of `SeriesCode.rows`, and one more.
     """
     names = [*code.start, *code.controls]
     rows = {name: i for i, name in enumerate([*names, *code.rows])}

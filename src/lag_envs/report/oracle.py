@@ -486,8 +486,8 @@ class Oracle:
         series = FormulaSeries(formulas, inputs, self._constants(formulas, plan.bits))
         mass, force = [series.found[i * n : (i + 1) * n] for i in range(n)], series.found[n * n :][:n]
         driven = {
-            name: ([h * rate, h * h * push / 2], [h * push])
-            for name, (_, rate, push) in self.driven(q, v, u, flint.arb(0)).items()
+            name: ([h * rate, h * h * held / 2], [h * held])
+            for name, (_, rate, held) in self.driven(q, v, u, flint.arb(0)).items()
         }
         a: list[list] = [[] for _ in free]
         for k in itertools.count():
@@ -577,8 +577,8 @@ class Oracle:
                 t = h * x
                 q_now = {name: q[name] + t * v[name] + about[i][c] for c, name in enumerate(free)}
                 v_now = {name: v[name] + along[i][c] for c, name in enumerate(free)}
-                for name, (place, rate, push) in driven.items():
-                    q_now[name], v_now[name] = place + t * (rate + t * push / 2), rate + t * push
+                for name, (place, rate, held) in driven.items():
+                    q_now[name], v_now[name] = place + t * (rate + t * held / 2), rate + t * held
                 if i == 0:
                     end = q_now, v_now
                 given = [*(q_now[m] for m in self.equations.q), *(v_now[m] for m in self.equations.v)]

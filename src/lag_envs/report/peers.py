@@ -176,7 +176,7 @@ class Heyoka(LibraryRival):
         size, count, span = problems.equation.size, len(problems), dt * steps
         start, p = blocks(problems.y[:size], width), blocks(problems.p, width)
         rows = start.copy()
-        step = _stepper(integrator) if steps == 1 else None
+        step = _compiled_step(integrator) if steps == 1 else None
         if step is not None:
             loop, work = _loop(), np.empty((3, width))
 
@@ -228,7 +228,7 @@ class Heyoka(LibraryRival):
 _engines: list[Any] = []
 
 
-def _stepper(integrator: Any) -> int | None:
+def _compiled_step(integrator: Any) -> int | None:
     """Return the address of heyoka's compiled step, or None if it cannot be loaded.
 
     The step is heyoka's own object code, as its integrator runs it: ``step(state, pars, time, h,

@@ -187,7 +187,7 @@ def _step(equation: Equation, method: str, carried: bool) -> list[str]:
     y, p = _names(equation)
     trace = ElementaryTrace()
     given = trace.inputs(*y, *p, "t", "h")
-    formula = equation.stepper(method, carried)
+    formula = equation.step_of(method, carried)
     moved = formula(given[: len(y)], given[len(y) : -2], *given[-2:], Arithmetic(trace))
     lines, ends = record_block(trace, {f"z{i}": z for i, z in enumerate(moved)})
     return [*lines, *(f"{name} = {z}" for name, z in zip(y, ends, strict=True))]

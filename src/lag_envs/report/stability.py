@@ -204,7 +204,7 @@ def step_cases(
     if scene.angle is not None:
         y = [*y, np.cos(y[scene.angle]), np.sin(y[scene.angle])]
     for i in range(int(counts.max())):
-        moved = fast(scene.unpack(y, u, k), scene.drive(y, u, k, np), h, np)
+        moved = fast(scene.unpack(y, u, k), scene.coefficients_at(y, u, k, np), h, np)
         new = scene.pack(moved, y, u, h, k)
         y = [np.where(i < counts, a, b) for a, b in zip(new, y, strict=True)]
         if any(a.dtype != dtype for a in y):

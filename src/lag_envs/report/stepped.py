@@ -12,7 +12,7 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.compiling import absent_from
-from lag_envs.stepping.flows import Flow, Stepper
+from lag_envs.stepping.flows import Flow, FlowCode
 
 
 class Stepped:
@@ -46,9 +46,9 @@ class Stepped:
         """Return the lifted state."""
         return self.form.lift(state)
 
-    def drive(self, y: Any, u: Any, k: Any, xp: Any) -> Any:
+    def coefficients_at(self, y: Any, u: Any, k: Any, xp: Any) -> Any:
         """Return the flow's coefficients."""
-        return self.form.drive(y, [u], k, xp)
+        return self.form.coefficients_at(y, [u], k, xp)
 
     def unpack(self, y: Any, u: Any, k: Any) -> list:
         """Return the flow's variables."""
@@ -61,15 +61,15 @@ class Stepped:
     def at(self, state: ArrayLike, u: Any) -> tuple[list, Any]:
         """Return the flow's variables and coefficients at a state under a control."""
         y, k = self.lift(np.asarray(state, np.float64)), SimpleNamespace(**motion_constants_of(self.scene))
-        return self.unpack(y, u, k), self.drive(y, u, k, np)
+        return self.unpack(y, u, k), self.coefficients_at(y, u, k, np)
 
     def largest_majorant(self, dt: float) -> float:
         """Return the x of the bound up to which one series is certified."""
         return pendulum.largest_majorant(dt, self.flow.order or pendulum.ORDER)
 
-    def stepper(self) -> Stepper:
+    def code(self) -> FlowCode:
         """Return the code of a step, without the constants that are zero."""
-        return Stepper(self.form, self.flow, absent_from(motion_constants_of(self.scene)))
+        return FlowCode(self.form, self.flow, absent_from(motion_constants_of(self.scene)))
 
     def present(self) -> list[float]:
         """Return the constants of the code."""

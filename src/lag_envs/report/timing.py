@@ -54,7 +54,7 @@ class FlowSteps:
 
     def __init__(self, scene: Scene, flow: Flow | None = None, dt: float = 0.02) -> None:
         self.stepped = Stepped(scene, flow, dt)
-        self._code = self.stepped.stepper()
+        self._code = self.stepped.code()
         self._names = [name.removeprefix("k_") for name in self._code.constants]
         #: Whether every step is an ordinary one, as with the comparison integrators.
         self.plain = any(line == "within = True" for line in self._code.fast)

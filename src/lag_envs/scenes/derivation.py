@@ -80,7 +80,7 @@ def motion_constants_of(scene: Scene, lagged: bool = False) -> dict[str, float]:
     found = vars(scene).get(kept)
     if found is None:
         try:
-            found = _stepper(scene, lagged).constants(parameter_values(scene))
+            found = _form_or_series(scene, lagged).constants(parameter_values(scene))
         except (ArithmeticError, ValueError) as error:  # a division by 0, the root of a negative number, ...
             raise ValueError(undefined(scene)) from error
         if not all(map(math.isfinite, found.values())):
@@ -97,8 +97,8 @@ def undefined(scene: Scene) -> str:
     )
 
 
-def _stepper(scene: Scene, lagged: bool) -> Any:
-    """Return the scene's stepper: its normal form or the general series, always the series if lagged."""
+def _form_or_series(scene: Scene, lagged: bool) -> Any:
+    """Return the normal form of a scene, or its general series; always the series if lagged."""
     if lagged:
         from lag_envs.stepping.lag import lagged_stepper
 
@@ -135,4 +135,4 @@ def code_of(scene: Scene, dt: float, lagged: bool = False) -> Any:
 
     absent = absent_from(motion_constants_of(scene, lagged))
     form = None if lagged else form_of(scene)
-    return form.stepper(dt, absent) if form else _stepper(scene, lagged).code(absent)
+    return form.code(dt, absent) if form else _form_or_series(scene, lagged).code(absent)

@@ -187,7 +187,7 @@ def vjp(
     if form_of(scene):
         check_turns(scene, states)
     seeds = seeds.reshape(-1, n)
-    found = pulled(scene, states, controls, check_step(dt), seeds, by)
+    found = vjp_of_rows(scene, states, controls, check_step(dt), seeds, by)
     if not np.isfinite(found).all():
         row = int(np.argwhere(~np.isfinite(found))[0, 0])
         raise ValueError(
@@ -199,7 +199,7 @@ def vjp(
     return parts[:2] if parameters is None else parts
 
 
-def pulled(
+def vjp_of_rows(
     scene: Scene,
     states: Array,
     controls: Array,

@@ -111,7 +111,7 @@ class Backward(Series):
 
     # --- the step ------------------------------------------------------------------------------------------
 
-    def pull(
+    def vjp(
         self,
         t: Any,
         inputs: dict[str, Any],

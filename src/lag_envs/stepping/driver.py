@@ -19,8 +19,8 @@ from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.machine import (
     LaneLayout,
     compile_attempt,
-    compile_pull,
     compile_series_tangent,
+    compile_vjp,
     registers,
 )
 from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Series
@@ -277,7 +277,7 @@ def _compile_lengths() -> tuple[Callable, Callable]:
     return enough_of, next_length
 
 
-def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
+def _vjp_all(given, cotangents, found, longest, constants, starts, by_start, by_end, dt, order):  # type: ignore[no-untyped-def]
     """Take control steps, then the same substeps backwards.
 
     No substep is longer than its lane's entry of `longest`. Where that was too long for the derivatives, a
@@ -287,11 +287,11 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
     Each row of `given` is an entry of the state or the controls, each row of `cotangents` one of the state
     after the step. `found` is filled in: its rows are entries of state, controls and parameters. The series
     has other variables, which depend linearly on these: inputs, places and velocities are
-    ``constants + starts @ given``. `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the
+    ``constants + starts @ given``. `found` becomes ``direct.T @ cotangents`` plus ``by_start.T`` times the
     cotangents of places, velocities and sources. `by_end` holds the derivatives of places and velocities with
     respect to the state, followed by `direct`.
     """
-    wanted, count = len(pulled), given.shape[1]
+    wanted, count = len(by_start), given.shape[1]
     order = min(order + further, LARGEST_ORDER)
     table, bars = np.zeros((bounds + wanted + 1, BLOCK)), np.empty((wanted, BLOCK))
     again = np.zeros_like(table)
@@ -317,8 +317,8 @@ def _pull_all(given, cotangents, found, longest, constants, starts, pulled, by_e
                 if by_end[c, 2 * n + r] != 0.0:
                     add(found[r, first:], by_end[c, 2 * n + r], cotangents[c, first:], filled)
             for c in range(wanted):
-                if pulled[c, r] != 0.0:
-                    add(found[r, first:], pulled[c, r], bars[c], filled)
+                if by_start[c, r] != 0.0:
+                    add(found[r, first:], by_start[c, r], bars[c], filled)
 
 
 def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untyped-def]
@@ -345,7 +345,7 @@ def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untype
         put(before, table[left], BLOCK)
         still = 0
         for begin in range(0, going, LANES):
-            back = pull(table.reshape(-1), begin, dt, order, tolerance) > 0
+            back = vjp(table.reshape(-1), begin, dt, order, tolerance) > 0
             until = min(begin + LANES, going)
             if back and turns == 0 and at_once(table[left], table[bounds + len(bars)], begin):
                 for r in range(len(bars)):
@@ -410,7 +410,7 @@ def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # ty
             for r in range(len(bars)):
                 table[bounds + r, i] = bars[r, lane]
         for i in range(0, some, LANES):
-            pull(table.reshape(-1), i, dt, order, -1.0)
+            vjp(table.reshape(-1), i, dt, order, -1.0)
         for i in range(some):
             lane, used = lanes[begin + i], ends[2 * n + 1, begin + i]
             longest[lane] = min(longest[lane], enough_of(used, dt, table[bounds + len(bars), i], order))
@@ -435,17 +435,17 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 
 
 @cache
-def compile_pull_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
-    """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
+def compile_vjp_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
+    """Compile ``vjp_all(given, cotangents, found, ..., dt, order)``, see `_vjp_all` and `compile_vjp`."""
     width = max(4, registers().doubles)  # even small series need many numbers on the way back
     steep = any(node.op in STEEP for node in record.nodes)
     stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
     numbers = _numbers(record, TOLERANCE * stricter)
     numbers |= {"BLOCK": BLOCK, "LANES": width, "further": further, "LARGEST_ORDER": LARGEST_ORDER}
-    pull, enough_of = compile_pull(record, sources, width), _compile_lengths()[0]
+    vjp, enough_of = compile_vjp(record, sources, width), _compile_lengths()[0]
     fill, put, add = (compile_python(f.__name__[1:], f, inner=True) for f in (_fill, _put, _add))
     at_once = compile_python("at_once", _at_once, inner=True, COMPLETE=COMPLETE, LANES=width)
-    helpers = pull, enough_of, at_once, fill, put
+    helpers = vjp, enough_of, at_once, fill, put
     forwards = compile_python("forwards", _forwards, *helpers, inner=True, **numbers)
-    stored = compile_python("stored", _stored, pull, enough_of, inner=True, **numbers)
-    return compile_python("pull_all", _pull_all, forwards, stored, fill, put, add, **numbers)
+    stored = compile_python("stored", _stored, vjp, enough_of, inner=True, **numbers)
+    return compile_python("vjp_all", _vjp_all, forwards, stored, fill, put, add, **numbers)

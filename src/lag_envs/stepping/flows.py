@@ -32,7 +32,7 @@ class Flow(NamedTuple):
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether a step is ordinary, and ``compile(absent)``
     makes the scalar function for any step; `absent` names the coefficients that are zero.
-    ``pull(variables, coefficients, dt, bars, xp)`` records an ordinary step backwards, from cotangents of the
+    ``vjp(variables, coefficients, dt, bars, xp)`` records an ordinary step backwards, from cotangents of the
     first two variables to those of variables and coefficients. ``compile_tangent(absent, by)`` makes the
     function that differentiates any step with respect to the variables and the coefficients in `by`.
     ``order`` is the order of the certified series, 0 if there is none. ``method`` describes how a step is
@@ -44,7 +44,7 @@ class Flow(NamedTuple):
     order: int
     fast: Callable
     within: Callable
-    pull: Callable
+    vjp: Callable
     compile: Callable
     compile_tangent: Callable
     method: str
@@ -54,17 +54,17 @@ class Flow(NamedTuple):
 def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
     """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
 
-    def fast(variables: Sequence, drive: pendulum.Coefficients, dt: Any, xp: Any) -> tuple:
+    def fast(variables: Sequence, coeffs: pendulum.Coefficients, dt: Any, xp: Any) -> tuple:
         theta, omega, c, s = variables
-        return pendulum.step(theta, omega, c, s, drive, dt, order)
+        return pendulum.step(theta, omega, c, s, coeffs, dt, order)
 
     return Flow(
         4,
         pendulum.Coefficients,
         order,
         fast,
-        lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
-        lambda variables, drive, dt, bars, xp: pendulum.pull(variables, drive, dt, bars, order),
+        lambda variables, coeffs, dt, x, xp: pendulum.certified(variables[1], coeffs, dt, x, xp),
+        lambda variables, coeffs, dt, bars, xp: pendulum.vjp(variables, coeffs, dt, bars, order),
         lambda absent: pendulum.compile_flow(absent, order),
         lambda absent, by: pendulum.compile_tangent(absent, by, order),
         f"one Taylor series of order {order}, no trigonometry",
@@ -72,13 +72,13 @@ def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
 
 
 def _backwards(fast: Callable) -> Callable:
-    """Return a flow's `pull`: reverse mode on its recorded fast formula."""
+    """Return a flow's `vjp`: reverse mode on its recorded fast formula."""
 
-    def pull(variables: Sequence, coefficients: Any, dt: Any, bars: Sequence, xp: Differentiable) -> list:
+    def vjp(variables: Sequence, coefficients: Any, dt: Any, bars: Sequence, xp: Differentiable) -> list:
         ends = fast(variables, coefficients, dt, xp)[:2]
         return xp.adjoint(ends, bars, [*variables, *coefficients])
 
-    return pull
+    return vjp
 
 
 def _slide(variables: Sequence, force: slope.FixedSlope, dt: Any, xp: Any) -> tuple:
@@ -95,7 +95,7 @@ SLIDE = Flow(
     slope.FixedSlope,
     0,
     _slide,
-    lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
+    lambda variables, force, dt, x, xp: slope.slides(force, dt),
     _backwards(_slide),
     slope.compile_slide,
     slope.compile_slide_tangent,
@@ -165,7 +165,7 @@ def lift_lines(n: int, angle: int | None, y: str) -> list[str]:
     return [] if angle is None else [f"{y}{n} = math.cos({y}{angle})", f"{y}{n + 1} = math.sin({y}{angle})"]
 
 
-class Stepper:
+class FlowCode:
     """One scene's control step as lines of code.
 
     The lines take the lifted state ``y0, y1, ...``, the controls ``u0, ...``, the step ``dt``, the bound's
@@ -200,7 +200,7 @@ class Stepper:
 
         def prepare(xp: Any, *values: Any) -> list:
             y, u, rest = split_lengths(values, width, controls)
-            return [*form.unpack(y, u, k(rest)), *form.drive(y, u, k(rest), xp)]
+            return [*form.unpack(y, u, k(rest)), *form.coefficients_at(y, u, k(rest), xp)]
 
         def finish(xp: Any, *values: Any) -> Sequence:
             moved, y, u, (dt,), rest = split_lengths(values, flow.size, width, controls, 1)
@@ -256,7 +256,7 @@ class Stepper:
         body = [*self.any_step, f"return {', '.join(self.end)}, status"]
         return compile_lines("advance", self.arguments, body, self.engine())
 
-    @cache  # noqa: B019 - steppers are kept anyway
+    @cache  # noqa: B019 - these codes are kept anyway
     def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...]) -> Callable:
         """Compile ``jacobian(states, controls, out, dt, x, constants...)``.
 
@@ -317,7 +317,7 @@ class Stepper:
         arguments = ", ".join(["states, controls, out, dt, x", *self.constants])
         return compile_lines("jacobian", arguments, body, self._tangent(by))
 
-    def pull(
+    def record_vjp(
         self,
         xp: Differentiable,
         state: Sequence,
@@ -343,13 +343,13 @@ class Stepper:
         """
         form, flow, angle = self._form, self.flow, self._angle
         lifted = state if angle is None else [*state, xp.cos(state[angle]), xp.sin(state[angle])]
-        variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
+        variables, coefficients = form.unpack(lifted, u, k), form.coefficients_at(lifted, u, k, xp)
         # The end is linear in the moved variables, so the values of these variables are not needed.
         moved = xp.inputs("moved0", "moved1")
         ends = form.pack([*moved, *variables[2:]], lifted, u, k.dt, k)[: self._n_state]
         *bars, direct = split_lengths(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)
-        pulled = flow.pull(variables, coefficients, k.dt, [bar for (bar,) in bars], xp)
-        found = xp.adjoint([*variables, *coefficients], pulled, by)
+        earlier = flow.vjp(variables, coefficients, k.dt, [bar for (bar,) in bars], xp)
+        found = xp.adjoint([*variables, *coefficients], earlier, by)
         within = flow.within(variables, coefficients, k.dt, k.x, xp)
         return [a + b for a, b in zip(direct, found, strict=True)], within
 
@@ -369,7 +369,7 @@ class Stepper:
                 **{name.removeprefix("k_"): numbers[name] for name in ("dt", "x", *self._names)}
             )
             by = [*state, *u, *(numbers[f"k_{name}"] for name in constants)]
-            found, within = self.pull(xp, state, u, k, bars, by)
+            found, within = self.record_vjp(xp, state, u, k, bars, by)
             return [*split_lengths(found, len(state) + len(u)), [xp.where(within, 1.0, 0.0)]]
 
         absent = set(self._names) - set(self.constants)

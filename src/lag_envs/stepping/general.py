@@ -44,7 +44,7 @@ class SeriesStepper:
         self._lowering, self._parts = self._lowered()
         self._whole = self._lowering.without(*self._parts)
         converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
-        self._codes: dict[tuple[frozenset[str], bool], StepCode] = {}
+        self._codes: dict[tuple[frozenset[str], bool], SeriesCode] = {}
         self._tangents: dict[tuple[str, ...], tuple[Lowering, tuple[list[int], dict]]] = {}
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
 
@@ -198,13 +198,13 @@ class SeriesStepper:
 
     # --- code -----------------------------------------------------------------------------------------------
 
-    def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> StepCode:
+    def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesCode:
         """Return the step without the terms of constants that are zero.
 
         An unfused step has the same bits as plain + - * / √ and comparisons on any machine.
         """
         if (absent, fused) not in self._codes:
-            self._codes[absent, fused] = StepCode(self, self.record(absent, fused), absent, fused)
+            self._codes[absent, fused] = SeriesCode(self, self.record(absent, fused), absent, fused)
         return self._codes[absent, fused]
 
     def record(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesRecord:
@@ -246,7 +246,7 @@ class StepBound(NamedTuple):
     kind: str
 
 
-class StepCode:
+class SeriesCode:
     """The code of a control step.
 
     Attributes
@@ -425,7 +425,7 @@ def stepper_of(mechanics: Mechanics, kind: type[SeriesStepper] = SeriesStepper) 
     return _steppers[kind, mechanics.key]
 
 
-def series_code_of(scene: Any) -> tuple[StepCode, list[float]]:
+def series_code_of(scene: Any) -> tuple[SeriesCode, list[float]]:
     """Return the code with which the general series steps a scene, and the constants that it takes."""
     stepper = stepper_of(scene.mechanics)
     constants = stepper.constants(parameter_values(scene))

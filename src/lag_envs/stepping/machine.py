@@ -495,13 +495,13 @@ def _write_tangent(
     return function
 
 
-def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> Callable:
-    """Return ``pull(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
+def compile_vjp(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> Callable:
+    """Return ``vjp(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
 
     Rows are `BLOCK` numbers apart: those of `LaneLayout` up to `wish`, then cotangents of places and
     velocities after the substep, and of the sources, and an estimate of what they leave out, relative to
     them. All but the inputs are replaced. It returns 1 if the lanes that ended their step went backwards, see
-    `Backward.pull`.
+    `Backward.vjp`.
 
     Parameters
     ----------
@@ -512,14 +512,14 @@ def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> 
     lanes : int
         How many steps are taken at once.
     """
-    digest = hashlib.sha256(f"{_version()} {record.digest} {sources} {lanes} pull".encode()).hexdigest()[:16]
+    digest = hashlib.sha256(f"{_version()} {record.digest} {sources} {lanes} vjp".encode()).hexdigest()[:16]
     kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE])
     return _linked(
-        f"pull_{digest}", kind, lambda module, name: _write_pull(module, name, kind, record, sources, lanes)
+        f"vjp_{digest}", kind, lambda module, name: _write_vjp(module, name, kind, record, sources, lanes)
     )
 
 
-def _write_pull(
+def _write_vjp(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, sources: tuple, lanes: int
 ) -> ir.Function:
     """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
@@ -543,7 +543,7 @@ def _write_pull(
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
     before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
     bars = [read(layout.bounds + i) for i in range(2 * n + len(sources))]
-    lane, bars, back = step.pull(t, inputs, before, t.broadcast(dt), order, t.broadcast(tolerance), bars)
+    lane, bars, back = step.vjp(t, inputs, before, t.broadcast(dt), order, t.broadcast(tolerance), bars)
     for first, values in ((layout.q, [*lane.q, *lane.v, *lane[2:]]), (layout.bounds, bars)):
         for row, value in enumerate(values, first):
             builder.store(value, pointer(row)).align = 8

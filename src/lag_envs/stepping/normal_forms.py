@@ -31,7 +31,7 @@ from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import absent_from
-from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
+from lag_envs.stepping.flows import SLIDE, TURN, Flow, FlowCode, pendulum_flow
 from lag_envs.stepping.general import StepBound
 from lag_envs.stepping.tracing import Trace
 
@@ -111,7 +111,7 @@ class NormalForm:
         """Return the state's entries, each of shape (...), followed by cosine and sine of the angle."""
         return tuple(lifted(self, np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), np))
 
-    def drive(self, y: Sequence, u: Sequence, k: Any, xp: Any) -> Any:
+    def coefficients_at(self, y: Sequence, u: Sequence, k: Any, xp: Any) -> Any:
         """Return the flow's coefficients under held controls, from lifted state and constants."""
         values: dict[Atom, Any] = {control(name): x for name, x in zip(self.layout.controls, u, strict=True)}
         for entry, x in zip(self.layout.state, y, strict=False):
@@ -154,8 +154,8 @@ class NormalForm:
             elif entry.kind == "velocity" or by.level == "rate":
                 after.append(given[entry.name] + dt * given[by.control])
             else:
-                rate, push = given[f"{by.name}_dot"], given[by.control]
-                after.append(given[by.name] + dt * (rate + 0.5 * dt * push))
+                rate, held = given[f"{by.name}_dot"], given[by.control]
+                after.append(given[by.name] + dt * (rate + 0.5 * dt * held))
         return [*after, *moved[2:]]
 
     # --- derivatives ---------------------------------------------------------------------------------------
@@ -186,7 +186,7 @@ class NormalForm:
         Arguments and results are those of `SeriesTangent.jacobian`; `constants` are those of this form, and
         `rates` their derivatives with respect to the parameters.
         """
-        stepper, absent = self._stepper(dt, constants)
+        code, absent = self._code(dt, constants)
         by = tuple(
             name
             for name, terms in self.terms.items()
@@ -194,8 +194,8 @@ class NormalForm:
         )
         first = states.shape[1] + controls.shape[1]
         found = np.empty((*states.shape, first + len(rates)))
-        numbers = (constants[name.removeprefix("k_")] for name in stepper.constants)
-        jacobian = stepper.compile_jacobian(by, tuple(rates))
+        numbers = (constants[name.removeprefix("k_")] for name in code.constants)
+        jacobian = code.compile_jacobian(by, tuple(rates))
         refused = jacobian(states, controls, found, dt, self.largest_majorant(dt), *numbers)
         if not refused and not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
@@ -218,9 +218,9 @@ class NormalForm:
 
         The other arguments are those of `jacobian`, which is used if a step is not ordinary.
         """
-        stepper, _ = self._stepper(dt, constants)
+        code, _ = self._code(dt, constants)
         numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
-        slopes, by_rates, ordinary = stepper.vjp(tuple(rates))(numbers, states, controls, cotangents)
+        slopes, by_rates, ordinary = code.vjp(tuple(rates))(numbers, states, controls, cotangents)
         if parameters:
             by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
             slopes = np.concatenate([slopes, by_rates @ by_constants], axis=1)
@@ -233,16 +233,16 @@ class NormalForm:
             slopes[others] = np.einsum("ni,nij->nj", cotangents[others], jacobian)
         return slopes, 0
 
-    def _stepper(self, dt: float, constants: Mapping[str, float]) -> tuple[Stepper, frozenset[str]]:
+    def _code(self, dt: float, constants: Mapping[str, float]) -> tuple[FlowCode, frozenset[str]]:
         """Return the code of a step with these constants, and the names of those that are zero."""
         absent = absent_from(constants)
-        return self.stepper(dt, absent), absent
+        return self.code(dt, absent), absent
 
     # --- what depends on numbers ---------------------------------------------------------------------------
 
     def coefficients(self, state: ArrayLike, controls: Sequence, constants: Mapping[str, float]) -> Any:
         """Return the flow's coefficients as numbers, or arrays for states of shape (..., n_state)."""
-        return self.drive(self.lift(state), controls, SimpleNamespace(**constants), np)
+        return self.coefficients_at(self.lift(state), controls, SimpleNamespace(**constants), np)
 
     def largest_majorant(self, dt: float) -> float:
         """Return the largest x for which one series is certified; closed forms do not need it."""
@@ -265,9 +265,9 @@ class NormalForm:
         """Return the step's bounds, known before it is taken; see `Scene.step_bound`."""
         return StepBound(1, 0, dict.fromkeys(self.state_names, 0.0), "stepped to rounding")
 
-    def stepper(self, dt: float, absent: frozenset[str] = frozenset()) -> Stepper:
+    def code(self, dt: float, absent: frozenset[str] = frozenset()) -> FlowCode:
         """Return the code of a control step; constants that are zero leave no code."""
-        return _stepper(self, self.flow(dt), absent)
+        return _flow_code(self, self.flow(dt), absent)
 
 
 def lifted(form: NormalForm | None, y: Any, xp: Any) -> list:
@@ -277,8 +277,8 @@ def lifted(form: NormalForm | None, y: Any, xp: Any) -> list:
 
 
 @cache
-def _stepper(form: NormalForm, flow: Flow, absent: frozenset[str]) -> Stepper:
-    return Stepper(form, flow, absent)
+def _flow_code(form: NormalForm, flow: Flow, absent: frozenset[str]) -> FlowCode:
+    return FlowCode(form, flow, absent)
 
 
 class DrivenPendulum(NormalForm):
@@ -308,18 +308,18 @@ class DrivenPendulum(NormalForm):
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> float:
         """Return the largest |q'| for which one series per step is certified [rad/s]; see `NormalForm`."""
-        drive = self.kind(*map(float, self.coefficients(state, controls, constants)))
-        return pendulum.certified_speed(drive, dt, self.order(dt))
+        coeffs = self.kind(*map(float, self.coefficients(state, controls, constants)))
+        return pendulum.certified_speed(coeffs, dt, self.order(dt))
 
     def step_bound(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> StepBound:
         """Return the bound that is proved before the step."""
         bounds = dict.fromkeys(self.state_names, 0.0)
-        drive = self.kind(*map(float, self.coefficients(state, controls, constants)))
+        coeffs = self.kind(*map(float, self.coefficients(state, controls, constants)))
         free = self.layout.free[0]
         moving = [self._index(free, kind) for kind in ("place", "velocity")]
-        found = pendulum.truncation_bound(float(np.asarray(state)[moving[1]]), drive, dt, self.order(dt))
+        found = pendulum.truncation_bound(float(np.asarray(state)[moving[1]]), coeffs, dt, self.order(dt))
         for i, bound in zip(moving, (found.theta, found.theta_dot), strict=True):
             bounds[self.state_names[i]] = bound
         return StepBound(found.substeps, found.order, bounds, "proved before the step")

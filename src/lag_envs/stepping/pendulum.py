@@ -158,7 +158,7 @@ def step(theta: Any, omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, o
     return theta + angle, omega + change * (1.0 / h), c, s
 
 
-def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER) -> list:
+def vjp(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER) -> list:
     """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step from those of θ, θ' after it.
 
     The cotangents of cosθ and sinθ are included in that of θ. Changes obey the linearised equation: with S, C
@@ -187,8 +187,8 @@ def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, orde
     a, b, gamma, d, r = scaled(coeffs, h)
     W, C, S = [omega * h], [c], [s]
     for k in range(order):
-        push = d if k == 0 else r if k == 1 else 0.0
-        W.append((push - (a * S[k] + b * C[k]) - gamma * W[k]) * (1.0 / (k + 1)))
+        drive = d if k == 0 else r if k == 1 else 0.0
+        W.append((drive - (a * S[k] + b * C[k]) - gamma * W[k]) * (1.0 / (k + 1)))
         C.append(sum_of_products((S[j], W[k - j]) for j in range(k + 1)) * (-1.0 / (k + 1)))
         S.append(sum_of_products((C[j], W[k - j]) for j in range(k + 1)) * (1.0 / (k + 1)))
     Q = [a * x - b * y for x, y in zip(C, S, strict=True)]
@@ -261,14 +261,14 @@ def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
     """Return whether the conditions of the bound of one series hold for this x."""
     a, b, gamma, d, r = scaled(coeffs, h)
     speed, drag = xp.abs(omega * h), xp.abs(gamma)
-    first, push = speed + drag, xp.abs(d) + drag * speed
+    first, forced = speed + drag, xp.abs(d) + drag * speed
     # Without a ramp, the smallest y is best, and no root is needed.
-    room = x * (x - 0.5 * xp.maximum(first, 0.2 * x)) - push
+    room = x * (x - 0.5 * xp.maximum(first, 0.2 * x)) - forced
     field = a * a + b * b
     fits = (first <= x) & (room >= 0.0) & (field <= room * room)
     if _absent(r):
         return fits
-    second, most = (xp.abs(a) if _absent(b) else xp.sqrt(field)) + push, x * x
+    second, most = (xp.abs(a) if _absent(b) else xp.sqrt(field)) + forced, x * x
     # With a ramp, the largest y is best: the smaller of x and 2 (x - b/x).
     product = xp.minimum(most, 2.0 * (most - second)) * xp.maximum(0.5 * most, second)  # x y z
     return fits & ((first * second + xp.abs(r)) * x <= product)
@@ -351,15 +351,15 @@ def tail(x: float, order: int = ORDER) -> float:
 def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untyped-def]
     """Return x/h such that, for small h, the bound holds anywhere in the interval."""
     field = math.sqrt(alpha * alpha + beta * beta)
-    push = abs(delta) + abs(ramp) * dt
+    drive = abs(delta) + abs(ramp) * dt
     # The speed that the field can add is limited by the field's acceleration, and by its energy between top
     # and bottom, 2 field.
-    speed = min(abs(omega) + field * dt, math.sqrt(omega * omega + 4.0 * field)) + push * dt
-    if gamma * speed > field + push:
-        speed = max(abs(omega), (field + push) / gamma)
+    speed = min(abs(omega) + field * dt, math.sqrt(omega * omega + 4.0 * field)) + drive * dt
+    if gamma * speed > field + drive:
+        speed = max(abs(omega), (field + drive) / gamma)
     elif gamma < 0.0:
         speed *= math.exp(min(-gamma * dt, 700.0))
-    root = abs(gamma) + math.sqrt(gamma * gamma + 2.0 * (field + push)) + (2.0 * abs(ramp)) ** (1.0 / 3.0)
+    root = abs(gamma) + math.sqrt(gamma * gamma + 2.0 * (field + drive)) + (2.0 * abs(ramp)) ** (1.0 / 3.0)
     return max(speed, root)
 
 
@@ -491,14 +491,14 @@ def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # t
     too many substeps.
     """
     field = math.sqrt(alpha * alpha + beta * beta)
-    push = abs(delta) + abs(ramp) * dt
+    drive = abs(delta) + abs(ramp) * dt
     # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then follow the slow
-    # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2. If the field
-    # is negligible compared with the push, the drift is the whole motion.
-    drift = field <= 1e-18 * push and not field_counts
+    # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and drive/gamma² up to 1e-2. If the field
+    # is negligible compared with the drive, the drift is the whole motion.
+    drift = field <= 1e-18 * drive and not field_counts
     layer = dt
-    if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (drift or push <= 1e-2 * gamma * gamma):
-        layer = (40.0 + math.log(max(1.0, abs(omega) + (field + push) / gamma))) / gamma
+    if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (drift or drive <= 1e-2 * gamma * gamma):
+        layer = (40.0 + math.log(max(1.0, abs(omega) + (field + drive) / gamma))) / gamma
     slow = layer < 0.5 * dt
     if not slow:
         layer = dt
@@ -507,7 +507,7 @@ def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # t
     if slow:
         m = 1.0
         if not drift:
-            m = np.ceil(max(1.0, (12.0 * field + 4.0 * push) / gamma * (dt - layer)))
+            m = np.ceil(max(1.0, (12.0 * field + 4.0 * drive) / gamma * (dt - layer)))
     # A substep along the slow manifold costs as much as 50 plain substeps.
     if not n + 50.0 * m <= MAX_SUBSTEPS:
         n = -1.0

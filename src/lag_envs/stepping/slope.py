@@ -56,8 +56,8 @@ def slide(x: Any, v: Any, force: FixedSlope, dt: Any) -> tuple:
     decay = force.damping_rate * dt
     phi2 = polynomial(_PHI2, decay) if not (isinstance(decay, float) and decay == 0.0) else 0.5
     phi1 = 1.0 - decay * phi2
-    push = force.acceleration * dt
-    return x + dt * (v * phi1 + push * phi2), v * (1.0 - decay * phi1) + push * phi1
+    gained = force.acceleration * dt
+    return x + dt * (v * phi1 + gained * phi2), v * (1.0 - decay * phi1) + gained * phi1
 
 
 def slides(force: FixedSlope, dt: Any) -> Any:

@@ -139,7 +139,7 @@ class SeriesTangent:
         while len(rows):  # first all rows, then those whose substeps were too long for the derivatives
             before, parts = longest[some], [np.ascontiguousarray(x[:, some]) for x in (given, seeds, found)]
             shorter = before.copy()
-            self._pull(*parts, shorter, *linear, dt, order)
+            self._vjp(*parts, shorter, *linear, dt, order)
             given_up, too_long = rows[shorter == 0.0], rows[(0.0 < shorter) & (shorter < before)]
             found[:, some], longest[some] = parts[-1], shorter
             # In reverse mode no substep is longer than the shortest, so there may be too many substeps. In
@@ -153,7 +153,7 @@ class SeriesTangent:
         return found.T, 0
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
-        """Return the constants, and derivatives of the series' start and of the end state, for `_pull`.
+        """Return the constants, and derivatives of the series' start and of the end state, for `_vjp`.
 
         If no rate is held, all are the same for all states.
         """
@@ -197,7 +197,7 @@ class SeriesTangent:
         return tuple(name for name in self._columns if name not in self._moving)
 
     @cached_property
-    def _pull(self) -> Callable:
-        from lag_envs.stepping.driver import compile_pull_all
+    def _vjp(self) -> Callable:
+        from lag_envs.stepping.driver import compile_vjp_all
 
-        return compile_pull_all(self._record, self._sources)
+        return compile_vjp_all(self._record, self._sources)

@@ -377,7 +377,7 @@ class Task(_Made):
         if form is None:
             raise FormulaError(f"{type(self.scene).__name__} has no normal form; use its energies")
         k = SimpleNamespace(**motion_constants_of(self.scene)) if recorded is None else recorded.k
-        return form.drive(list(state), list(control), k, xp)
+        return form.coefficients_at(list(state), list(control), k, xp)
 
     #: The recorded constants, while formulas are recorded.
     _recording: Any = None

@@ -52,10 +52,10 @@ class _ChainTask(Support):
         arms = [i * scene.length + scene.com_distance for i in range(scene.bars)]
         turning = 0.5 * FASTEST_START**2 * sum(scene.mass * arm**2 + scene.inertia for arm in arms)
         fall = 2.0 * scene.mass * scene.gravity * sum(arms)
-        pushed = self.largest * math.sqrt(0.5 * scene.bars * scene.mass) * self.duration
+        driven = self.largest * math.sqrt(0.5 * scene.bars * scene.mass) * self.duration
         about_joint = scene.inertia + scene.mass * scene.com_distance**2
         kicked = self.largest_kick * math.sqrt(0.5 * about_joint) * self.limit
-        return (math.sqrt(turning + fall) + pushed + kicked) * math.sqrt(2.0 / scene.inertia)
+        return (math.sqrt(turning + fall) + driven + kicked) * math.sqrt(2.0 / scene.inertia)
 
     def occasional_kick(self, draws: Any, xp: Any) -> dict[str, Any]:
         """Return an occasional kick of the last bar's rate to either side."""

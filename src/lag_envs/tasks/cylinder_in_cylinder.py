@@ -61,15 +61,15 @@ class _Shell(Task):
     @property
     def fastest(self) -> float:
         """Speed from a fall, from a change of the shell's rate between its limits, and from drag [rad/s]."""
-        push = self.coefficients([0.0, 0.0, 0.0], [1.0], np)
-        return float(2.0 * math.sqrt(push.alpha) + (2.0 * push.delta + 1.0) * self.fastest_shell)
+        coeffs = self.coefficients([0.0, 0.0, 0.0], [1.0], np)
+        return float(2.0 * math.sqrt(coeffs.alpha) + (2.0 * coeffs.delta + 1.0) * self.fastest_shell)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
         """Return whether the cylinder has been carried too high."""
         return xp.abs(after.theta) > self.largest_angle
 
     def bounds(self) -> Mapping[str, float]:
-        """Return bounds on θ, θ' and ψ'; |θ'| grows by at most (weight + push U + drag ψ') a second."""
+        """Return bounds on θ, θ' and ψ'; |θ'| grows by at most (weight + gain U + drag ψ') a second."""
         strongest = self.coefficients([0.0, 0.0, self.fastest_shell], [self.largest], np)
         swing = FASTEST_START + (strongest.alpha + strongest.delta) * self.duration
         return {
@@ -520,7 +520,7 @@ class Damping(Task):
             Axis("θ [rad]", -2.5, 2.5, 80, scale=0.03, level=4),
             Axis("θ' [rad/s]", -9.0, 9.0, 80, scale=0.1, level=4),
         ),
-        pushes=4,
+        kick_sizes=4,
         lost=0.1,
         mirror="theta",
     )
@@ -587,8 +587,8 @@ TQC is as good as PPO within the uncertainty, with far fewer steps; SAC and TD3 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Occasionally change θ' by ±1.5 or ±3 rad/s."""
         size = xp.where(draws[1] < 0.5, 1.5, 3.0)
-        push = xp.where((draws[1] < 0.25) | (draws[1] >= 0.75), -size, size)
-        return {"theta_dot": xp.where(draws[0] < self.chance(0.01), push, 0.0)}
+        kick = xp.where((draws[1] < 0.25) | (draws[1] >= 0.75), -size, size)
+        return {"theta_dot": xp.where(draws[0] < self.chance(0.01), kick, 0.0)}
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return θ and θ'."""

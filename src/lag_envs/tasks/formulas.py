@@ -234,10 +234,10 @@ class TaskFormulas:
         lagged = bool(found and found.lag)
         return refusal(self._task.scene, state, control, dt, None, where, lagged=lagged)
 
-    def stepper(self, absent: frozenset[str]) -> Any:
+    def step_code(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""
         if self._form:
-            return self._form.stepper(self._task.dt, absent)
+            return self._form.code(self._task.dt, absent)
         return stepper_of(self._task.scene.mechanics).code(absent)
 
     # --- formulas -------------------------------------------------------------------------------------------

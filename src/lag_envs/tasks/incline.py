@@ -218,10 +218,10 @@ ends on the mark.
         else:
             rate, carried = self.largest_rate, self.scene.radius * self.largest_rate
             turn = self.coefficients([0.0, 0.0, 0.0], [rate], np)
-            push = (
+            acceleration = (
                 turn.gravity * math.sin(self.largest_tilt) + reach * rate * rate + turn.damping_rate * carried
             )
-            speed += carried + push * self.duration
+            speed += carried + acceleration * self.duration
         tilt = self.largest_tilt * (1.0 + 1e-6)
         x, v = self.scene.state_names[:2]
         return {x: self.edge + speed * self.dt, v: speed, "target": self.edge} | (

@@ -27,8 +27,8 @@ class _Bar(Support):
     def _strength(self) -> tuple[float, float]:
         """Return field and largest drive [1/s²]."""
         hang = [0.0] * len(self.scene.state_names)
-        drive = self.coefficients(hang, [self.largest], np)
-        return float(drive.alpha), abs(float(drive.beta))
+        coeffs = self.coefficients(hang, [self.largest], np)
+        return float(coeffs.alpha), abs(float(coeffs.beta))
 
     @property
     def fastest(self) -> float:
@@ -474,7 +474,7 @@ class Balance(_Bar):
         # On such a long track, neither its ends nor the cost of s matter.
         options={"track": 1e9},
         keep=(2, 3),
-        pushes=16,
+        kick_sizes=16,
         lost=0.6,
     )
     examples = Examples(

@@ -207,7 +207,7 @@ class ValueIteration:
     targets : tuple of float
         Targets to solve for, from 0 upwards. Other targets are interpolated, and negative ones mirrored.
         Empty: no target.
-    pushes : int
+    kick_sizes : int
         Number of kick sizes in the expectation: midpoints of as many parts of a kick's second random number.
     chance : float
         Chance of a kick per interval: a kick happens if its first random number is below this.
@@ -230,7 +230,7 @@ class ValueIteration:
     options: Mapping[str, Any] = field(default_factory=dict)
     keep: tuple[int, ...] = ()
     targets: tuple[float, ...] = ()
-    pushes: int = 0
+    kick_sizes: int = 0
     chance: float = 0.01
     actions: int = 11
     most: float = 1.0

@@ -61,17 +61,17 @@ class GuardedTrack(Support):
         # With v the speed at the step's end, and braking from there at U, the support stops at
         # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, this says that the support passes S or -S if v² +
         # |reach| > 2US.
-        s, s_dot, push = before.s, before.s_dot, wanted.s_ddot
+        s, s_dot, held = before.s, before.s_dot, wanted.s_ddot
         top, per_step = self.largest, self.largest * dt
         ends, start = 2.0 * (top * self.length), (2.0 * top) * s + per_step * s_dot
-        v = s_dot + dt * push
+        v = s_dot + dt * held
         reach = start + per_step * v
         side = xp.where(reach < 0.0, -1.0, 1.0)
         # The root of v² + U dt v + start = 2US, seen from that side, is the highest speed allowed.
         half = 0.5 * per_step
         highest = xp.sqrt(xp.maximum(half * half + ends - side * start, 0.0)) - half
         hardest = clip((highest - side * s_dot) * (1.0 / dt), -top, top, xp)
-        return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * push, hardest), push)
+        return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * held, hardest), held)
 
     def observe_support(self, after: Any) -> dict[str, Any]:
         """Return s/S and s'/2, or nothing without a track."""

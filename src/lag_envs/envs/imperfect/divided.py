@@ -64,7 +64,7 @@ class DividedProgram(WholeProgram):
         begin = [f"begin_{y}" for y in self.y]
         piece = [
             *self._choose(self._single), *_assigned(self.reaching, self.reached),
-            *self._span, *self._stepper.any_step, *indented("if status < 0:", self._leave_one),
+            *self._span, *self._code.any_step, *indented("if status < 0:", self._leave_one),
             *(f"{mean} += {share}" for mean, share in self._shares),
             *_assigned(self.in_force, self.in_force_after), *_assigned(self.y, self.z),
             "t = end", *self._sensors.watch(self._single),
@@ -142,8 +142,8 @@ class DividedProgram(WholeProgram):
         # Lanes that the fast formula does not cover are moved by the second loop.
         fast = ["moved = select(t < k_dt, select(within, 1.0, 2.0), 0.0)"]
         slow = ["moved = select(status < 0, 0.0, 1.0)", "failed = 1.0 - moved"]
-        first = [*self._load_piece, *self._span, *self._stepper.fast, *fast, *self._end_piece]
-        second = [*self._load_piece, *self._span, *self._stepper.any_step, *slow, *self._end_piece]
+        first = [*self._load_piece, *self._span, *self._code.fast, *fast, *self._end_piece]
+        second = [*self._load_piece, *self._span, *self._code.any_step, *slow, *self._end_piece]
         return [
             *indented(EACH_LANE, first),
             *indented(EACH_LANE, [*self._load(["moved"]), *indented("if moved == 2.0:", second)]),

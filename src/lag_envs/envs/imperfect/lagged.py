@@ -1,4 +1,4 @@
-"""A whole control step behind lagging actuators, in the form of a stepper's code."""
+"""A whole control step behind lagging actuators, in the form of `SeriesCode`."""
 
 from __future__ import annotations
 

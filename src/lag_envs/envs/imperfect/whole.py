@@ -31,7 +31,7 @@ class WholeProgram(DrawnProgram):
     @property
     def _printed(self) -> list[str]:
         parts = (self._actuators.perturb, self._actuators.at_rest, self._controls, self._sensors.sense)
-        lag = [self._x, *self._stepper.any_step, *self._stepper.prepare] if self.options.lag else []
+        lag = [self._x, *self._code.any_step, *self._code.prepare] if self.options.lag else []
         return [*super()._printed, *(line for part in parts for line in part), self._sensors.due, *lag]
 
     def _step_code(self, formulas: Any, absent: frozenset[str], constants: dict[str, Any]) -> Any:
