@@ -375,7 +375,7 @@ class Board:
             append("withdrawn", id=id, reason=reason)
 
     @contextmanager
-    def claimed(self, id: str) -> Iterator[bool]:
+    def reserved(self, id: str) -> Iterator[bool]:
         """Yield whether a submission is free to verify, and lock it if so."""
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
         with ExitStack() as stack:

@@ -113,26 +113,26 @@ def finish(
     state = board.read()
     if state.waiting():
         current(state, "verify submissions of")
-    with ExitStack() as claims:
-        claimed_here: dict[str, tuple[BoardEntry, str]] = {}
+    with ExitStack() as reserved:
+        reserved_here: dict[str, tuple[BoardEntry, str]] = {}
         for entry in state.waiting():
             if reason := closed(entry.env, entry.protocol, state.number):
                 board.rejected(entry.id, f"its board closed before it was verified: {reason}")
-            elif not claims.enter_context(board.claimed(entry.id)):
+            elif not reserved.enter_context(board.reserved(entry.id)):
                 tell(entry, "another process is verifying it")
                 continue
             else:
                 state = board.read()  # another process may just have finished it
                 nonce = state.nonce(entry)
                 if state.entry(entry.id).state == "pending" and nonce is not None:
-                    claimed_here[entry.id] = entry, nonce
+                    reserved_here[entry.id] = entry, nonce
                     continue
             tell(entry, _outcome(board, entry))
-        work = PendingCheck({id: (entry.digest, nonce) for id, (entry, nonce) in claimed_here.items()})
-        folders = [board.submission(id) for id in claimed_here]
+        work = PendingCheck({id: (entry.digest, nonce) for id, (entry, nonce) in reserved_here.items()})
+        folders = [board.submission(id) for id in reserved_here]
         neighbours = Neighbours(board)
         for folder, result in (parallel_map or partial(map_submissions, jobs=1))(work, folders):
-            entry = claimed_here[folder.name][0]
+            entry = reserved_here[folder.name][0]
             if isinstance(result, Refused):
                 board.rejected(entry.id, str(result))
             elif isinstance(result, BaseException):

@@ -17,7 +17,7 @@ from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, derivative, sub
 from lag_envs.mechanics.equations import EquationsOfMotion, derive, place, time_derivative, velocity
 from lag_envs.mechanics.identities import apply_identities
 from lag_envs.mechanics.layout import Prescribed, SceneLayout
-from lag_envs.mechanics.recording import Record, control, parameter, parameter_names
+from lag_envs.mechanics.recording import SceneRecord, control, parameter, parameter_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Mechanics:
     ----------
     layout : SceneLayout
         Names of coordinates, controls and state.
-    record : Record
+    record : SceneRecord
         The formulas, with parameters that are 0 put in.
     mass : dict
         Entries of the mass matrix of the free coordinates, (i, j) with i <= j, without zeros.
@@ -48,7 +48,7 @@ class Mechanics:
     """
 
     layout: SceneLayout
-    record: Record
+    record: SceneRecord
     mass: Mapping[tuple[int, int], Expr]
     force: tuple[Expr, ...]
     coupling: Mapping[tuple[int, str], Expr]
@@ -148,7 +148,7 @@ class Mechanics:
         )
 
 
-def _held(layout: SceneLayout, record: Record) -> dict[Atom, Expr]:
+def _held(layout: SceneLayout, record: SceneRecord) -> dict[Atom, Expr]:
     """Return the known places and velocities of the prescribed coordinates under held controls."""
     values: dict[Atom, Expr] = {}
     for name, level, by in layout.prescribed:
@@ -163,7 +163,9 @@ def _held(layout: SceneLayout, record: Record) -> dict[Atom, Expr]:
     return values
 
 
-def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Collection[str] = ()) -> Mechanics:
+def derive_motion(
+    scene: Any, layout: SceneLayout, found: SceneRecord, varying: Collection[str] = ()
+) -> Mechanics:
     """Derive the equations of motion from the results of a scene's formulas.
 
     Parameters
@@ -172,7 +174,7 @@ def derive_motion(scene: Any, layout: SceneLayout, found: Record, varying: Colle
         The scene: its class's name for error messages, and its parameters that are 0.
     layout : SceneLayout
         Its names.
-    found : Record
+    found : SceneRecord
         Its formulas.
     varying : collection of str
         Parameters whose values are not put in even if they are 0.

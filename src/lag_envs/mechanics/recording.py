@@ -148,7 +148,7 @@ def symbolic_twin(scene: Any) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class Record:
+class SceneRecord:
     """The results of a scene's formulas on symbols.
 
     Attributes
@@ -278,7 +278,7 @@ def single_expression(value: Any, what: str = "") -> Expr:
         raise FormulaError(f"{what}returns {value!r:.60}, which is not a real number") from None
 
 
-def record_scene(scene: Any, layout: SceneLayout) -> Record:
+def record_scene(scene: Any, layout: SceneLayout) -> SceneRecord:
     """Run all formulas of a scene on symbols.
 
     Raises
@@ -317,13 +317,13 @@ def record_scene(scene: Any, layout: SceneLayout) -> Record:
                 raise FormulaError(f"the place of {name!r} depends on more than parameters")
     with formula(scene, "poses"):
         poses = _poses(run("poses"))
-    found = Record(Energies(applied=applied, **parts), rests, poses)
+    found = SceneRecord(Energies(applied=applied, **parts), rests, poses)
     _check_controls(scene, layout, found)
     _check_dissipation(scene, parts["dissipation"])
     return found
 
 
-def check_again(scene: Any, layout: SceneLayout, found: Record) -> None:
+def check_again(scene: Any, layout: SceneLayout, found: SceneRecord) -> None:
     """Raise a FormulaError if a formula gives another result when it is run again."""
     again = record_scene(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
@@ -358,7 +358,7 @@ def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
     return poses
 
 
-def _check_controls(scene: Any, layout: SceneLayout, found: Record) -> None:
+def _check_controls(scene: Any, layout: SceneLayout, found: SceneRecord) -> None:
     used = {s.name for e in found.exprs() for s in e.symbols() if s.kind == "control"}
     moving = {p.control for p in layout.prescribed}
     for name in layout.controls:
@@ -386,7 +386,7 @@ def _check_dissipation(scene: Any, loss: Expr) -> None:
         )
 
 
-def restrict(found: Record, values: Mapping[Atom, Expr], scene: Any, why: str) -> Record:
+def restrict(found: SceneRecord, values: Mapping[Atom, Expr], scene: Any, why: str) -> SceneRecord:
     """Return a record with symbols replaced; errors name the formula and the reason for replacing."""
 
     def of(name: str, expr: Expr) -> Expr:
@@ -406,4 +406,4 @@ def restrict(found: Record, values: Mapping[Atom, Expr], scene: Any, why: str) -
     poses = {}
     for body, (x, y, angle) in found.poses.items():
         poses[body] = of("poses", x), of("poses", y), of("poses", angle)
-    return Record(energies, rests, poses)
+    return SceneRecord(energies, rests, poses)

@@ -19,7 +19,7 @@ from lag_envs.mechanics.equations import Energies, place, velocity
 from lag_envs.mechanics.evaluation import Exact, Numeric, exactly
 from lag_envs.mechanics.layout import SceneLayout, check_name
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import Record, Values, parameter_names
+from lag_envs.mechanics.recording import SceneRecord, Values, parameter_names
 from lag_envs.scenes import picture
 from lag_envs.scenes.checks import run_check, shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
@@ -207,14 +207,14 @@ def _terms(expr: Expr) -> list[Expr]:
 
 
 def _on_numbers(scene: Any, q: Values, v: Values, u: Values) -> list:
-    """Return the results of the scene's formulas on plain numbers, in the order of `Record.exprs`."""
+    """Return the results of the scene's formulas on plain numbers, in the order of `SceneRecord.exprs`."""
     energies = Energies(
         kinetic=scene.kinetic(q, v, Numeric),
         potential=scene.potential(q, Numeric),
         dissipation=scene.dissipation(q, v, u, Numeric),
         applied=scene.applied(q, v, u, Numeric),
     )
-    return Record(energies, scene.rests(), scene.poses(q, Numeric)).exprs()
+    return SceneRecord(energies, scene.rests(), scene.poses(q, Numeric)).exprs()
 
 
 def _check_motion(scene: Any, found: Mechanics) -> None:
