@@ -11,7 +11,6 @@ from covering import slow
 from mpmath import mp, mpf
 from rollouts import actions, make
 
-from lag_envs import scenes
 from lag_envs.controllers import Constant, Random, make_controller
 from lag_envs.evaluation.rollout import play
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
@@ -23,10 +22,21 @@ PI = math.pi
 # --- the table ---
 
 
+BAR = {
+    "mass": 0.2, "com_distance": 0.3, "inertia": pytest.approx(0.006, rel=1e-15), "damping": 0.001,
+    "gravity": 9.81, "track": 0.5,
+}  # fmt: skip
+PLANE = {"mass": 1.0, "radius": 0.05, "inertia": pytest.approx(0.5 * 0.05**2), "gravity": 9.81}
+SHELL = {
+    "mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "inertia": pytest.approx(0.005), "gravity": 9.81,
+}  # fmt: skip
+
+
 class Row:
-    """One row of the table: dt, steps, boxes of the start, and the task's formulas in the order of a step."""
+    """One row of the table: dt, steps, the scene, boxes of the start, and formulas in the order of a step."""
 
     dt, steps = 0.02, 500
+    ends: bool | None = True  # whether the test's actions end episodes, None if it does not matter
     largest = 1.0  # control
     target = 0.0  # half width
     kicks: tuple = ()
@@ -39,7 +49,7 @@ class Row:
 
 
 class PivotedBar(Row):
-    task = pivoted_bar.SwingUp
+    task, scene, ends = pivoted_bar.SwingUp, BAR, False
     start = ((0, 0.05), (0, 0.02), (0, 0.1), (0, 0.1))
     largest, track = 5.0, 0.5
 
@@ -54,7 +64,7 @@ class PivotedBar(Row):
 
 
 class PivotedBarFree(Row):
-    task = pivoted_bar.SwingUpFree
+    task, scene, ends = pivoted_bar.SwingUpFree, BAR | {"track": None}, False
     start = ((0, 0.1), (0, 0.1))
     largest = 5.0
 
@@ -66,7 +76,7 @@ class PivotedBarFree(Row):
 
 
 class PivotedBarBalance(Row):
-    task = pivoted_bar.Balance
+    task, scene = pivoted_bar.Balance, BAR
     start = ((0, 0.2), (0, 0.2), (PI, 0.15), (0, 0.3))
     largest = 3.0
 
@@ -82,9 +92,16 @@ class PivotedBarBalance(Row):
     def kicked(self, size):
         return abs(size) <= 1.0
 
+    def check_kicks(self, kicks):
+        assert_uniform((np.sort(kicks) + 1) / 2)
+
+    def acceleration(self, theta, theta_dot, u):
+        moment = 0.06 * (u * np.cos(theta) + 9.81 * np.sin(theta))
+        return -(moment + 0.001 * theta_dot) / (0.006 + 0.2 * 0.3**2)
+
 
 class InclineTilt(Row):
-    task = incline.Tilt
+    task, scene = incline.Tilt, PLANE | {"damping": 0.03}
     dt, steps = 0.05, 200
     start = ((0, 0.4), (0, 0.3), (0, 0.05))
     largest, target = 0.3, 0.3
@@ -103,14 +120,14 @@ class InclineTilt(Row):
 
 
 class InclineBrake(Row):
-    task = incline.Brake
+    task, scene = incline.Brake, PLANE | {"damping": 0.0, "tilt": pytest.approx(PI / 12)}
     start = ((-2, 1.0), (0.5, 0.5))
 
     def control(self, a, y):
         return 3.0 * (1 + a)
 
     def reward(self, y, u, target):
-        return -0.02  # the last step has a test of its own
+        return None if self.ended(y) else -0.02  # the last step has a test of its own
 
     def ended(self, y):
         return y[0] >= 0.0
@@ -120,7 +137,7 @@ class InclineBrake(Row):
 
 
 class CylinderInCylinderTilt(Row):
-    task = cylinder_in_cylinder.Tilt
+    task, scene = cylinder_in_cylinder.Tilt, SHELL | {"damping": 0.24}
     dt, steps = 0.05, 200
     start = ((0, 0.1), (0, 0.2), (0, 0.0))
     largest, target, fastest, highest = 15.0, 0.3, 6.0, 1.05
@@ -139,7 +156,7 @@ class CylinderInCylinderTilt(Row):
 
 
 class CylinderInCylinderPump(CylinderInCylinderTilt):
-    task = cylinder_in_cylinder.Pump
+    task, scene, ends = cylinder_in_cylinder.Pump, SHELL | {"damping": 0.024}, None
     largest, target, fastest, highest = 4.0, 0.0, 3.0, 1.3
 
     def reward(self, y, u, target):
@@ -153,7 +170,7 @@ class CylinderInCylinderPump(CylinderInCylinderTilt):
 
 
 class CylinderInCylinderDamping(Row):
-    task = cylinder_in_cylinder.Damping
+    task, scene, ends = cylinder_in_cylinder.Damping, SHELL | {"damping": 0.0}, None
     start = ((0, 0.8), (0, 1.0))
 
     def control(self, a, y):
@@ -173,21 +190,24 @@ class CylinderInCylinderDamping(Row):
     def kicked(self, size):
         return min(abs(abs(size) - 1.5), abs(abs(size) - 3.0)) < 1e-12
 
+    def check_kicks(self, kicks):
+        counts = [np.sum(np.abs(kicks - size) < 1e-7) for size in (-3.0, -1.5, 1.5, 3.0)]
+        assert sum(counts) == len(kicks)
+        assert np.abs(np.array(counts) - len(kicks) / 4).max() < 5 * math.sqrt(len(kicks) / 4)
 
-ROWS = {
-    cls.task.id: cls()
-    for cls in (
-        PivotedBar,
-        PivotedBarFree,
-        PivotedBarBalance,
-        InclineTilt,
-        InclineBrake,
-        CylinderInCylinderTilt,
-        CylinderInCylinderPump,
-        CylinderInCylinderDamping,
-    )
-}
-each_id = pytest.mark.parametrize("env_id", ROWS)
+    def acceleration(self, theta, theta_dot, u):
+        return -2 / 3 * 9.81 / 0.4 * np.sin(theta) - 2 / 3 * u / 0.16 * theta_dot
+
+
+def each(*rows):
+    return pytest.mark.parametrize("row", rows, ids=lambda row: row.task.id)
+
+
+KICKED = PivotedBarBalance(), CylinderInCylinderDamping()
+PAID_BY_THE_STEP = (
+    PivotedBar(), PivotedBarFree(), InclineTilt(), CylinderInCylinderTilt(), CylinderInCylinderPump(), *KICKED
+)  # fmt: skip
+each_row = each(*PAID_BY_THE_STEP, InclineBrake())
 
 
 def nearest_safe(s, s_dot, wanted, top, track, dt):
@@ -216,35 +236,16 @@ def bold(env, i, rng):
 # --- the step ---
 
 
-@each_id
-def test_parameters_and_time(env_id):
-    env, row = make(env_id), ROWS[env_id]
+@each_row
+def test_parameters_and_time(row):
+    env = make(row.task.id)
     assert (env.task.dt, env.task.limit) == (row.dt, row.steps)
-    scene = env.scene
-    kind = type(env.task)
-    if issubclass(kind.scene, scenes.PivotedBar):
-        assert (scene.mass, scene.com_distance, scene.damping) == (0.2, 0.3, 0.001)
-        assert scene.inertia == pytest.approx(0.006, rel=1e-15)
-        assert scene.track == (None if kind is pivoted_bar.SwingUpFree else 0.5)
-    elif issubclass(kind.scene, scenes.Incline):
-        assert (scene.mass, scene.radius, scene.inertia) == (1.0, 0.05, pytest.approx(0.5 * 0.05**2))
-        assert scene.damping == (0.03 if kind is incline.Tilt else 0.0)
-        assert kind is incline.Tilt or scene.tilt == pytest.approx(PI / 12)
-    else:
-        assert (scene.mass, scene.shell_radius, scene.radius, scene.inertia) == (
-            1.0,
-            0.5,
-            0.1,
-            pytest.approx(0.005),
-        )
-        slow = {cylinder_in_cylinder.Tilt: 0.24, cylinder_in_cylinder.Pump: 0.024}
-        assert scene.damping == slow.get(kind, 0.0)
-    assert scene.gravity == 9.81
+    assert {name: getattr(env.scene, name) for name in row.scene} == row.scene
 
 
-@each_id
-def test_every_step_is_as_the_table_says(env_id):
-    env, row = make(env_id), ROWS[env_id]
+@each_row
+def test_every_step_is_as_the_table_says(row):
+    env = make(row.task.id)
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     n, ends, cuts, kicks = 0, 0, 0, 0
@@ -264,8 +265,8 @@ def test_every_step_is_as_the_table_says(env_id):
             jump[-1] = 0.0
         np.testing.assert_allclose(jump, 0.0, atol=1e-13)
         # Reward and ending look at the state before the kick, the observation at the one after it.
-        if not (terminated and env_id == incline.Brake.id):
-            assert reward == pytest.approx(row.reward(after, u, target), rel=1e-12, abs=1e-14)
+        if (expected := row.reward(after, u, target)) is not None:
+            assert reward == pytest.approx(expected, rel=1e-12, abs=1e-14)
         assert terminated == row.ended(after)
         np.testing.assert_allclose(
             observation, np.float32(row.observe(env.state, target)), rtol=3e-7, atol=1e-7
@@ -275,17 +276,13 @@ def test_every_step_is_as_the_table_says(env_id):
         if terminated or truncated:
             env.reset()
             n = 0
-    if env_id in ("PivotedBar-v0", pivoted_bar.SwingUpFree.id):
-        assert ends == 0 and cuts > 0
-    elif type(env.task) not in (cylinder_in_cylinder.Pump, cylinder_in_cylinder.Damping):
-        assert ends > 0
+    assert row.ends is None or (ends > 0 if row.ends else ends == 0 and cuts > 0)
     assert (kicks > 0) == hasattr(row, "kicked")
 
 
-@each_id
-def test_starts(env_id):
-    row = ROWS[env_id]
-    envs = gym.make_vec(env_id, num_envs=20_000)
+@each_row
+def test_starts(row):
+    envs = gym.make_vec(row.task.id, num_envs=20_000)
     envs.reset(seed=0)
     columns = list(envs.state.T)
     boxes = list(row.start)
@@ -315,16 +312,11 @@ def assert_uniform(share):
     assert np.abs(share - (np.arange(n) + 0.5) / n).max() < 2.5 / math.sqrt(n)
 
 
-def rolled(env_id, y, u, dt):
+def rolled(row, y, u, dt):
     """Return the angle's rate after a step, by classical Runge-Kutta steps for all environments at once."""
 
     def rate(y):
-        if env_id == pivoted_bar.Balance.id:
-            about_pivot = 0.006 + 0.2 * 0.3**2
-            return np.array(
-                [y[1], -(0.06 * (u * np.cos(y[0]) + 9.81 * np.sin(y[0])) + 0.001 * y[1]) / about_pivot]
-            )
-        return np.array([y[1], -2 / 3 * 9.81 / 0.4 * np.sin(y[0]) - 2 / 3 * u / 0.16 * y[1]])
+        return np.array([y[1], row.acceleration(*y, u)])
 
     h = dt / 100
     for _ in range(100):
@@ -336,16 +328,16 @@ def rolled(env_id, y, u, dt):
 
 
 @pytest.mark.parametrize("dt", [0.02, slow(0.2), slow(0.005)])
-@pytest.mark.parametrize("env_id", [pivoted_bar.Balance.id, cylinder_in_cylinder.Damping.id])
-def test_kicks(env_id, dt):
+@each(*KICKED)
+def test_kicks(row, dt):
     n, steps = 4000, 20
-    envs = gym.make_vec(env_id, num_envs=n, dt=dt, autoreset_mode="Disabled")
+    envs = gym.make_vec(row.task.id, num_envs=n, dt=dt, autoreset_mode="Disabled")
     envs.reset(seed=1)
     sizes = []
     for action in actions(steps, n, 1):
         before = envs.state.T[-2:]
         *_, terminated, truncated, _ = envs.step(action)
-        jump = envs.state.T[-2:] - rolled(env_id, before, envs.control, dt)
+        jump = envs.state.T[-2:] - rolled(row, before, envs.control, dt)
         np.testing.assert_allclose(jump[0], 0.0, atol=1e-9)
         sizes.append(jump[1])
         if (over := terminated | truncated).any():
@@ -354,17 +346,12 @@ def test_kicks(env_id, dt):
     kicks = sizes[np.abs(sizes) > 1e-7]
     chance = 1 - 0.99 ** (dt / 0.02)
     assert abs(len(kicks) - chance * len(sizes)) < 5 * math.sqrt(chance * len(sizes))
-    if env_id == pivoted_bar.Balance.id:
-        assert_uniform((np.sort(kicks) + 1) / 2)
-    else:
-        counts = [np.sum(np.abs(kicks - size) < 1e-7) for size in (-3.0, -1.5, 1.5, 3.0)]
-        assert sum(counts) == len(kicks)
-        assert np.abs(np.array(counts) - len(kicks) / 4).max() < 5 * math.sqrt(len(kicks) / 4)
+    row.check_kicks(kicks)
 
 
-@pytest.mark.parametrize("env_id", [i for i in ROWS if i != incline.Brake.id])
-def test_running_rewards_with_another_interval(env_id):
-    env, row = make(env_id, dt=0.03), ROWS[env_id]
+@each(*PAID_BY_THE_STEP)
+def test_running_rewards_with_another_interval(row):
+    env = make(row.task.id, dt=0.03)
     env.reset(seed=3)
     for a in actions(50, 1):
         before, target = env.state, env.target
