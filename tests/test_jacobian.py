@@ -98,7 +98,7 @@ def test_exact_flows(kind, n):
         assert (np.abs(found - expected) <= 1e-12 * size).all(), case
 
 
-#: Slow manifold and boundary layer, with a field from the control, or one that is negligible beside the push.
+#: Slow manifold and boundary layer, with a field from the control, or one that is negligible beside it.
 HEAVY = {
     "support at rest": ("PivotedBar", {"damping": 40.0}, [0.1, 0.0, 2.0, -30.0], 0.0, 0.02),
     "support driven": ("PivotedBar", {"damping": 4e3}, [0.1, 0.0, 2.0, 3.0], 9.0, 0.05),
