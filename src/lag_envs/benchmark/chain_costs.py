@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.benchmark import energies
+from lag_envs.benchmark.chain_swing import ChainSwing
 from lag_envs.benchmark.divisions import BATCH, divided
+from lag_envs.benchmark.energies import LONGEST
 from lag_envs.benchmark.rounds import ENERGIES
 from lag_envs.envs.vector import LagrangianVectorEnv
 
@@ -19,8 +20,8 @@ Costs = dict[str, Any]
 def chain_divisions() -> dict[int, float]:
     """Return the mean number of series that a step is divided into, by the number of bars."""
     return {
-        n: divided(LagrangianVectorEnv(energies.CHAIN, BATCH, autoreset_mode="SameStep", bars=n))["mean"]
-        for n in range(1, energies.LONGEST + 1)
+        n: divided(LagrangianVectorEnv(ChainSwing, BATCH, autoreset_mode="SameStep", bars=n))["mean"]
+        for n in range(1, LONGEST + 1)
     }
 
 

@@ -6,28 +6,32 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from lag_envs.benchmark.chain_swing import ChainSwing
 from lag_envs.benchmark.environments import stepped
 from lag_envs.benchmark.rounds import ENERGIES, Contestant, Run
 from lag_envs.envs.vector import LagrangianVectorEnv
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
 
-#: The task with chains, and the number of bars of the longest chain.
-CHAIN, LONGEST = "lag_envs.benchmark.chain_swing:ChainSwing", 6
+#: Number of bars of the longest chain.
+LONGEST = 6
 
 
 def of_energies(sizes: Sequence[int]) -> list[Contestant]:
     """Return the exact CartPole and the double pendulum at all sizes, and chains of bars at one size."""
     # Batches of thousands of long chains would take minutes until their episodes are staggered.
     middle = max((n for n in sizes if n <= 1024), default=min(sizes))
-    some: list[tuple[str, str, dict[str, Any], int]]
-    some = [("CartPole, exact", "lag_envs.tasks.cart_pole:CartPoleExact", {}, n) for n in sizes]
-    some += [("Chain(2)", CHAIN, {"bars": 2}, n) for n in sizes]
-    some += [(f"Chain({i})", CHAIN, {"bars": i}, middle) for i in (1, *range(3, LONGEST + 1))]
+    exact = next(task for task in TASKS.values() if task.peer == "CartPole-v1")
+    some: list[tuple[str, type[Task], dict[str, Any], int]]
+    some = [("CartPole, exact", exact, {}, n) for n in sizes]
+    some += [("Chain(2)", ChainSwing, {"bars": 2}, n) for n in sizes]
+    some += [(f"Chain({i})", ChainSwing, {"bars": i}, middle) for i in (1, *range(3, LONGEST + 1))]
     return [
         Contestant(ENERGIES, id, "vector", n, partial(energies, task, given, n))
         for id, task, given, n in some
     ]
 
 
-def energies(task: str, given: dict[str, Any], n: int) -> Run:
-    """Prepare a vector environment of a task, "module:Class"."""
+def energies(task: type[Task], given: dict[str, Any], n: int) -> Run:
+    """Prepare a vector environment of a task."""
     return stepped(LagrangianVectorEnv(task, n, **given))
