@@ -23,7 +23,7 @@ from agents.report import stored
 from agents.results import ROOT, write_envs
 from agents.run import FIRST_FRESH_SEED, check_env, check_numbers, fresh_seeds, reports_errors
 from lag_envs import TASKS
-from lag_envs.controllers import ILQR, build
+from lag_envs.controllers import build
 from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import mean_and_error, rounded_data
 from lag_envs.host import machine
@@ -37,7 +37,7 @@ def planning(env_id: str) -> Iterator[str]:
     """Yield the controllers of an environment that plan during an episode."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
-        if found.plans and not isinstance(build(task, name), ILQR):  # this one plans before the episode
+        if found.plans and not getattr(build(task, name), "plans_at_start", False):
             yield name
 
 

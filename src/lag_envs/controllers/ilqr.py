@@ -70,6 +70,9 @@ class ILQR:
        1168-1175.
     """
 
+    #: All planning is done at the start of an episode.
+    plans_at_start = True
+
     def __init__(
         self,
         task: Task,
