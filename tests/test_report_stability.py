@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from lag_envs.report import bound, extremes, reference, stability, stability_maps, stability_results
-from lag_envs.report.cases import Case, ensemble, scales
+from lag_envs.report import bound, extremes, reference, stability, stability_results
+from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.oracle import Unresolved
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
@@ -159,7 +159,7 @@ def test_heavy_damping():
     assert errors["lag_envs, float32"] == stability_results.TOO_LONG
 
 
-@pytest.mark.parametrize("name", stability_maps.STARTS)
+@pytest.mark.parametrize("name", VARIANTS)
 def test_ordinary_cells(name):
     """In float64 lag_envs is exact to rounding; in float32 every method is as exact as float32 can be."""
     rows = list(stability.map_errors("damping", name, 0.02, [1e-3, 1e-2]))

@@ -22,6 +22,9 @@ class Variant(NamedTuple):
     dt: float  #: control step [s]
     state_range: Sequence[float]  #: bounds of the states, in the scene's units
     controls: tuple[float, float]
+    start: tuple[float, ...]  #: of the stability maps; float32 holds its entries exactly
+    control: float  #: of the stability maps
+    typical: bool = False  #: whether libraries that are slow to compile or to run are measured on it too
 
     def scene(self, **changes: Any) -> Scene:
         """Return the scene, with other parameters if given."""
@@ -32,24 +35,30 @@ class Variant(NamedTuple):
 VARIANTS = {
     variant.name: variant
     for variant in (
-        Variant("PivotedBar", PivotedBar, {"damping": 0.001, "track": None}, 0.02, (math.pi, 12), (-5, 5)),
-        Variant("Incline, drag", Incline, {"tilt": math.pi / 12}, 0.02, (3, 3), (0, 6)),
         Variant(
-            "Incline, moving",
-            Incline,
-            {"damping": 0.03, "control": "tilt_rate"},
-            0.05,
-            (0.5, 1, 0.1),
-            (-0.3, 0.3),
+            "PivotedBar", PivotedBar, {"damping": 0.001, "track": None},
+            0.02, (math.pi, 12), (-5, 5), (2.0, 3.0), 3.0, typical=True,
         ),
         Variant(
-            "CylinderInCylinder, drag", CylinderInCylinder, {"control": "damping"}, 0.02, (1.3, 5), (0, 2.4)
+            "Incline, drag", Incline, {"tilt": math.pi / 12},
+            0.02, (3, 3), (0, 6), (0.5, 2.0), 0.0,
         ),
         Variant(
-            "CylinderInCylinder, tilt", CylinderInCylinder, {"damping": 0.024}, 0.05, (1.3, 5, 6), (-15, 15)
+            "Incline, moving", Incline, {"damping": 0.03, "control": "tilt_rate"},
+            0.05, (0.5, 1, 0.1), (-0.3, 0.3), (0.25, 1.0, 0.125), 0.25, typical=True,
+        ),
+        Variant(
+            "CylinderInCylinder, drag", CylinderInCylinder, {"control": "damping"},
+            0.02, (1.3, 5), (0, 2.4), (1.0, 3.0), 0.0,
+        ),
+        Variant(
+            "CylinderInCylinder, tilt", CylinderInCylinder, {"damping": 0.024},
+            0.05, (1.3, 5, 6), (-15, 15), (1.0, 3.0, 1.0), 3.0, typical=True,
         ),
     )
-}
+}  # fmt: skip
+#: The variant of quick reports, and of measurements that are made on a single one.
+MAIN = "PivotedBar"
 
 
 class Case(NamedTuple):

@@ -33,6 +33,8 @@ class LibraryRival(Rival):
     #: The methods to measure, each with tolerances or, if its steps are fixed, with substeps per control
     #: step.
     settings: ClassVar[dict[str, Sequence[float]]]
+    #: Whether it is slow to compile or to run, and so is measured on typical variants only.
+    slow: ClassVar[bool] = False
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
@@ -307,7 +309,7 @@ class Diffrax(LibraryRival):
     diffrax's controller chooses each state's steps, or all steps have the same length ("fixed").
     """
 
-    family = "diffrax"
+    family, slow = "diffrax", True
     settings: ClassVar = {
         "Tsit5": TOLERANCES[::2], "Dopri8": TOLERANCES[::2], "Tsit5, fixed": (1, 4, 16),
         "Dopri8, fixed": (1, 2, 4),
@@ -373,7 +375,7 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
 class Torchdiffeq(LibraryRival):
     """torchdiffeq on tensors of all states, which share their steps; the loop over steps is in Python."""
 
-    family = "torchdiffeq"
+    family, slow = "torchdiffeq", True
     settings: ClassVar = {
         "dopri5": TOLERANCES[::2], "dopri8": TOLERANCES[::2], "rk4, fixed": SUBSTEPS[:3],
     }  # fmt: skip

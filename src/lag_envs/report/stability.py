@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lag_envs.report import extremes, reference
-from lag_envs.report.cases import Case, scales
+from lag_envs.report.cases import MAIN, Case, scales
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.integrators import comparison
 from lag_envs.report.points import LAG_ENVS, ROUNDING
@@ -43,7 +43,7 @@ def jobs(quick: bool) -> list[ReportJob]:
         low, high = map.exponents
         values = _decades(low, high, 7 if quick else 2 * (high - low) + 1)
         for name in map.scenes:
-            if quick and (title, name) != ("damping", "PivotedBar"):
+            if quick and (title, name) != ("damping", MAIN):
                 continue
             for dt in _decades(-6, 0, 5 if quick else 13):
                 arguments = {"map": title, "name": name, "dt": dt, "values": values}

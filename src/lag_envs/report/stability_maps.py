@@ -5,18 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from lag_envs.report.cases import VARIANTS, Case
+from lag_envs.report.cases import MAIN, VARIANTS, Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
-
-#: Start (entries that float32 holds exactly) and control of the maps.
-STARTS: dict[str, tuple[tuple[float, ...], float]] = {
-    "PivotedBar": ((2.0, 3.0), 3.0),
-    "Incline, drag": ((0.5, 2.0), 0.0),
-    "Incline, moving": ((0.25, 1.0, 0.125), 0.25),
-    "CylinderInCylinder, drag": ((1.0, 3.0), 0.0),
-    "CylinderInCylinder, tilt": ((1.0, 3.0, 1.0), 3.0),
-}
 
 
 class StabilityMap(NamedTuple):
@@ -31,7 +22,7 @@ class StabilityMap(NamedTuple):
 def _damped(name: str, decay: float, dt: float) -> Case:
     variant = VARIANTS[name]
     per_drag = _drag(variant.scene(damping=1.0))
-    return Case(variant.scene(damping=decay / dt / per_drag), *STARTS[name])
+    return Case(variant.scene(damping=decay / dt / per_drag), variant.start, variant.control)
 
 
 def _drag(scene: Scene) -> float:
@@ -41,16 +32,13 @@ def _drag(scene: Scene) -> float:
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:
-    """Return a case that has a closed-form reference however far it moves; shells have no drive."""
-    state, u = STARTS[name]
-    if speed is not None:
-        state = (state[0], speed, *state[2:])
-    if control is None:
-        control = u if name == "PivotedBar" else 0.0
-    return Case(VARIANTS[name].scene(damping=0.0, **changes), state, control)
+    """Return a case that has a closed-form reference however far it moves."""
+    variant = VARIANTS[name]
+    state = variant.start if speed is None else (variant.start[0], speed, *variant.start[2:])
+    return Case(variant.scene(damping=0.0, **changes), state, variant.control if control is None else control)
 
 
-_BAR, _SHELL = ["PivotedBar"], ["CylinderInCylinder, drag"]
+_BAR, _SHELL = [MAIN], ["CylinderInCylinder, drag"]
 _SHELL_RADIUS = 0.5
 
 MAPS = {

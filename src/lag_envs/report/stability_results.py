@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lag_envs.report import extremes
+from lag_envs.report.cases import MAIN, VARIANTS
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.points import LAG_ENVS
 from lag_envs.report.runner import JobResult, Row
-from lag_envs.report.stability_maps import MAPS, STARTS
+from lag_envs.report.stability_maps import MAPS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -209,14 +210,14 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
     pictures = []
     for (map, name), rows in maps.items():
         for n, times in (("", "in one step"), (", 16", "in 16 steps")):
-            if n and (map, name) != ("damping", "PivotedBar"):
+            if n and (map, name) != ("damping", MAIN):
                 continue
             pictures.append(
                 ReportFigure(
                     f"stability-{map}-{_slug(name)}{n.replace(', ', '-')}",
                     f"{name}: error of one control step over {MAPS[map].label} and the step; comparison "
                     f"integrators {times}. Each map is shown next to the same map in float32. Start "
-                    f"{STARTS[name][0]}. Reference: 30 digits.",
+                    f"{VARIANTS[name].start}. Reference: 30 digits.",
                     partial(_draw_map, rows, MAPS[map].label, n),
                     raster=True,
                 )

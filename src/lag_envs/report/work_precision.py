@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lag_envs.report import peers, reference
-from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
+from lag_envs.report.cases import MAIN, VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
 from lag_envs.report.integrators import METHODS, comparison, plain_series
 from lag_envs.report.points import MODES, ROUNDING
@@ -60,12 +60,6 @@ QUICK = {
     "10 s": Horizon(10.0, 1, (1 / 4, 1, 4), 128),
 }
 QUICK_METHODS = ("Verlet", "RK4", "RK4, carried", "DOP853, carried")
-QUICK_VARIANTS = ("PivotedBar",)
-#: Libraries that are slow to compile or to run, so they are measured on one variant per kind of equation.
-COVERED = {
-    "diffrax": ("PivotedBar", "Incline, moving", "CylinderInCylinder, tilt"),
-    "torchdiffeq": ("PivotedBar", "Incline, moving", "CylinderInCylinder, tilt"),
-}
 #: Longest time for the errors of one point [s]; slower points are not run.
 LIMIT = 2.0
 #: Approximate seconds for one sample of its time.
@@ -79,7 +73,7 @@ def control_step(variant: str) -> float:
 
 def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: references, then points of lag_envs and the usual integrators, then of libraries."""
-    names = QUICK_VARIANTS if quick else tuple(VARIANTS)
+    names = (MAIN,) if quick else tuple(VARIANTS)
     horizons = QUICK if quick else HORIZONS
     made = [
         ReportJob(
@@ -92,12 +86,13 @@ def jobs(quick: bool) -> list[ReportJob]:
         for horizon in horizons
         for name in names
     ]
-    made.append(ReportJob(SECTION, "orders", f"{SECTION}:orders", {"variant": "PivotedBar", "quick": quick}))
+    made.append(ReportJob(SECTION, "orders", f"{SECTION}:orders", {"variant": MAIN, "quick": quick}))
     for name in names:
+        variant = VARIANTS[name]
         kinds = [
             package
             for package, peer in peers.PEERS.items()
-            if name in COVERED.get(package, names) and peer.solves(VARIANTS[name].scene())
+            if (variant.typical or not peer.slow) and peer.solves(variant.scene())
         ]
         made += [
             ReportJob(
