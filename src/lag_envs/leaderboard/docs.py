@@ -13,6 +13,7 @@ from typing import Any
 
 from lag_envs.generated import replaced
 from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.goals import goal_text
 from lag_envs.leaderboard.protocol import boards
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.options import module_parser
@@ -93,15 +94,8 @@ def _scored(row: dict[str, Any], digits: int = 4) -> str:
 
 
 def goals() -> str:
-    """Return a table of the success criteria.
-
-    The board's log freezes the tasks' texts as rules, so one of their phrases is replaced only here.
-    """
-    texts = {
-        env_id: TASKS[env_id].goal.text.replace("until it is so for good", "until it stays there")
-        for env_id in boards()
-    }
-    rows = [(env_id, text[0].upper() + text[1:]) for env_id, text in texts.items()]
+    """Return a table of the success criteria."""
+    rows = [(env_id, goal_text(TASKS[env_id].goal.text)) for env_id in boards()]
     return markdown_table(("environment", "success and time"), rows)
 
 

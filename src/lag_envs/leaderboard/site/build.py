@@ -21,6 +21,7 @@ from markupsafe import Markup
 from tqdm import tqdm
 
 from lag_envs import store
+from lag_envs.leaderboard.goals import goal_by_column
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import driving
 from lag_envs.leaderboard.site.scenery import Scenery, page_json, scenery_data
@@ -291,7 +292,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     largest = max((abs(x) for x in returns if isinstance(x, int | float)), default=0.0)
     # All returns have as many digits, so that they line up.
     board["digits"] = 1 if largest >= 100.0 else 2 if largest >= 10.0 else 3
-    board["goals"] = _goals(board["goal"])
+    board["goals"] = goal_by_column(board["goal"])
     board["page"] = _slug(str(given["id"]))
     if board["protocol"] != protocol:
         board["page"] += f"-protocol-{re.sub('[^0-9]+', '-', str(board['protocol']))}"
@@ -307,26 +308,6 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     board["poster"] = scenery.still(states, target) if states else None
     board |= {"states": states, "goal_of_states": target}
     return board
-
-
-def _goals(goal: str | None) -> dict[str, str]:
-    """Return what success and time mean, by column; what the column's own text says is left out.
-
-    Examples
-    --------
-    >>> _goals("success: across the line; time: until then")
-    {'success': 'across the line', 'settle': 'until success'}
-    >>> _goals("success: upright; time: until it is so for good"), _goals("success: up; there is no time")
-    ({'success': 'upright'}, {'success': 'up'})
-    """
-    if not goal:
-        return {}
-    joined = goal.removeprefix("success: ").replace(", and time: ", "; time: ")
-    success, _, time = joined.partition("; time: ")
-    time = (
-        time.removeprefix("until it is so for good").removeprefix(", ").replace("until then", "until success")
-    )
-    return {"success": success.removesuffix("; there is no time")} | ({"settle": time} if time else {})
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
