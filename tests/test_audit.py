@@ -16,7 +16,7 @@ from covering import every, slow
 from fake_submissions import ENV, write
 
 from lag_envs import cli
-from lag_envs.leaderboard import audit, log
+from lag_envs.leaderboard import audit, checks, history, log, protocol
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.pending import finish
@@ -66,7 +66,7 @@ def fill(board):
 def fakes(monkeypatch):
     fake_submissions.install(monkeypatch.setattr)
     # This package's release knows another board.
-    monkeypatch.setattr(audit, "PIN", Path("nowhere") / "pin.json")
+    monkeypatch.setattr(history, "PIN", Path("nowhere") / "pin.json")
     monkeypatch.setattr(audit, "REFERENCE_EPISODES", 64)
 
 
@@ -153,7 +153,7 @@ def consistent(result):
         replay["return"] = 23.5 * 419.0
         # Episodes with equal returns keep their order.
         number = {"median": 9, "best": 19, "worst": 0}[replay["label"]]
-        first = audit.protocol.first_seed(result["digest"], result["nonce"], 2)
+        first = protocol.first_seed(result["digest"], result["nonce"], 2)
         replay["reset_seed"], replay["seed"] = first + number, 2
 
 
@@ -313,7 +313,7 @@ def test_name_and_files_and_digest_are_edited(board):
     relog(board, told)
     shutil.rmtree(board.folder.parent / ".git")
     assert "is of digest" in refused(board)
-    first_seed = audit.protocol.first_seed
+    first_seed = protocol.first_seed
 
     def moved(result):
         result["digest"] = digest
@@ -387,10 +387,10 @@ def test_a_nonce_of_a_beacon_is_to_be_looked_up(board):
 @needs_git
 def test_the_commit_that_is_the_nonce_must_hold_the_board(board):
     head = commit(board)
-    assert audit.head_of(board) == head
+    assert history.head_of(board) == head
     board.add(fake_submissions.load(write(board.folder.parent / "new", "new")))
     with pytest.raises(BoardError, match="has changed since the last commit; commit and push first"):
-        audit.head_of(board)
+        history.head_of(board)
 
 
 # --- history, and the pin -----------------------------------------------------------------------------------
@@ -429,7 +429,7 @@ def test_boards_that_were_started_over_before_logs_had_a_chain(board):
     commit(board)
     board.log.write_bytes(whole)
     commit(board)
-    found = audit.cheap(board)
+    found = checks.cheap(board)
     assert "1 belong to boards that were started over" in found.findings[2].told and not refused(board)
 
 
@@ -443,9 +443,9 @@ def test_without_a_repository(board):
 
 def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
     pin = tmp_path / "pin.json"
-    audit.write_pin(board, pin)
+    checks.write_pin(board, pin)
     shutil.rmtree(board.folder.parent / ".git")
-    monkeypatch.setattr(audit, "PIN", pin)
+    monkeypatch.setattr(history, "PIN", pin)
     assert refused(board) == ""
     board.publish("goes-on", "https://example.org")  # a board grows beyond its pin
     assert refused(board) == "" and wrong(board) == {}
@@ -468,15 +468,15 @@ def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
     assert refused(other) == "" and "pin" in wrong(other, pin=pin)
     before = pin.read_bytes()
     with pytest.raises(BoardError, match=r"pin.json stays as it is: this is not the board .* another FILE"):
-        audit.write_pin(other)
+        checks.write_pin(other)
     assert pin.read_bytes() == before
     assert "pin" in wrong(other, pin=tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"board": 1}', "[" * 10**5])
 def test_a_bad_pin_is_refused(board, tmp_path, monkeypatch, content):
-    monkeypatch.setattr(audit, "PIN", tmp_path / "pin.json")
-    audit.PIN.write_text(content)
+    monkeypatch.setattr(history, "PIN", tmp_path / "pin.json")
+    history.PIN.write_text(content)
     assert "is not a pin" in refused(board)
 
 
@@ -532,7 +532,7 @@ def test_commands(board, tmp_path, capsys):
 @pytest.mark.slow  # `make audit` covers it too, and `make check` runs both
 def test_the_repositorys_board_is_sound():
     """The other checks of `make audit` take longer."""
-    found = audit.cheap(Board(ROOT / "leaderboard"))
+    found = checks.cheap(Board(ROOT / "leaderboard"))
     assert [text for finding in found.findings for text in finding.wrong] == []
     assert found.state.number in found.state.protocols
     chained = [line.event.prev for line in found.lines]

@@ -215,7 +215,7 @@ def _nonce(args: argparse.Namespace) -> int:
 
 def _publish(board: Board, value: str | None, source: str) -> None:
     """Publish a nonce; the hash of a commit is published with its source."""
-    from lag_envs.leaderboard.audit import head_of
+    from lag_envs.leaderboard.history import head_of
 
     if value is None:
         value, source = head_of(board), COMMIT
@@ -309,7 +309,7 @@ def _remark(row: dict[str, Any]) -> str:
 
 def _some(board: Board) -> BoardState:
     """Return the board's state; raise a BoardError if nothing is on it."""
-    from lag_envs.leaderboard.audit import sound
+    from lag_envs.leaderboard.checks import sound
 
     if not board.folder.is_dir():
         board.require()
@@ -328,7 +328,7 @@ def _some(board: Board) -> BoardState:
 
 
 def _show(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.audit import sound
+    from lag_envs.leaderboard.checks import sound
 
     board = Board(args.board)
     state = _some(board)
@@ -394,7 +394,8 @@ def _audit(args: argparse.Namespace) -> int:
     """Print each finding; return 1 if something is wrong."""
     from tqdm import tqdm
 
-    from lag_envs.leaderboard.audit import Finding, audit
+    from lag_envs.leaderboard.audit import audit
+    from lag_envs.leaderboard.history import Finding
 
     board = _existing(args)
     if args.pin and not args.pin.exists():
@@ -415,7 +416,8 @@ def _audit(args: argparse.Namespace) -> int:
 
 
 def _pin(args: argparse.Namespace) -> int:
-    from lag_envs.leaderboard.audit import PIN, write_pin
+    from lag_envs.leaderboard.checks import write_pin
+    from lag_envs.leaderboard.history import PIN
 
     pin = write_pin(_existing(args), args.file)
     print(f"{args.file or PIN}: {pin.lines} lines, head {pin.head}")

@@ -67,10 +67,10 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     Raises
     ------
     BoardError
-        If something on the board is not as it was logged, see `audit.sound`.
+        If something on the board is not as it was logged, see `checks.sound`.
     """
     from lag_envs.evaluation.statistics import rounded_data
-    from lag_envs.leaderboard.audit import sound
+    from lag_envs.leaderboard.checks import sound
     from lag_envs.leaderboard.combined import combined
 
     state, results = sound(board)
