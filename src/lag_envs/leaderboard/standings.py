@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lag_envs.leaderboard.board import Board, closed
 from lag_envs.leaderboard.files import read_plain
-from lag_envs.leaderboard.log import REMEDY, BoardEntry, BoardError, BoardState
+from lag_envs.leaderboard.log import REMEDY, BoardEntry, BoardError, BoardState, LoggedScale, Protocol
 from lag_envs.leaderboard.pending import shown_episodes
 from lag_envs.leaderboard.results import PACKED, checked_value
 from lag_envs.scores import KnownReturns, known_returns, normalised
@@ -98,65 +98,13 @@ def _environment(
     reached: dict[AgentIdentity, AgentScore],
 ) -> dict[str, Any]:
     """Return a board, and note the results of its ranked agents."""
-    from lag_envs.evaluation.statistics import ends, iqm, rounded_data
-    from lag_envs.leaderboard import ranking
-    from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
-
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
     told = state.protocols.get(number)
     scale = told.scales.get(env_id) if told else None
-    reference = told.references.get(env_id) if told else None
     rows = []
     if told is not None and scale is not None:
         found = {id: results[number, id] for id, e in entries.items() if e.state == "verified"}
-        scores = {id: ranking.scored(scale, reference, r["policies"]) for id, r in found.items()}
-        drawn = {id: ranking.redrawn(id, each) for id, each in scores.items()}
-        first = {id: state.first(entries[id]) for id in found}
-        # Rows that act like an earlier one are shown, but are not ranked, and no row is compared with them.
-        places = ranking.ranked({id: each for id, each in scores.items() if first[id] is None}, drawn)
-        ranks = {place.id: place for place in places}
-        for id in sorted(scores, key=lambda id: -float(iqm(scores[id].table.mean(axis=1)))):
-            entry, result, place = entries[id], found[id], ranks.get(id)
-            like = first[id]
-            row: dict[str, Any] = {
-                "id": id,
-                "rank": place and place.rank,
-                "above": place and place.above and list(place.above),
-                "alike": like and {"id": like.id, "name": like.name, "state": like.state},
-                "reference": scores[id].own,
-                "looks_like": _looks_like(entry, entries.values()),
-                "name": entry.name,
-                "kind": entry.kind,
-                "authors": list(entry.authors),
-                "state": entry.state,
-                "added": entry.added[:10],
-            }
-            row |= result["claimed"]
-            row["curves"] = [
-                {
-                    "seed": c["seed"], "steps": c["steps"],
-                    "scores": normalised(scale, c["returns"]).tolist(),
-                }
-                for c in result["claimed"]["curves"]
-            ]  # fmt: skip
-            row |= ranking.columns(env_id, result, told.rules.disturbed_episodes, scale, scores[id])
-            samples = iqm(drawn[id])
-            row["interval"] = list(ends(samples))
-            if place is not None:
-                agent = AgentIdentity(entry.name, tuple(entry.authors))
-                reached[agent] = AgentScore(row["score"], samples, entry.kind)
-            middle, chosen = shown_episodes(result)
-            verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
-            # States, actions and rewards are stored rounded.
-            replays = [
-                replay
-                | rounded_data({"return": replay["return"], "score": normalised(scale, replay["return"])})
-                | {"t0": 0.0}
-                for replay in result["replays"]
-                # Under protocol 1, the episodes of random actions were different ones.
-                if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
-            ]
-            rows.append(rounded_data(row) | {"replays": replays})
+        rows = _rows(env_id, told, state, entries, found, reached)
     return {
         "id": env_id,
         "protocol": number,
@@ -171,6 +119,78 @@ def _environment(
             if e.state != "verified"
         ],
     }
+
+
+def _rows(
+    env_id: str,
+    told: Protocol,
+    state: BoardState,
+    entries: Mapping[str, BoardEntry],
+    found: Mapping[str, dict[str, Any]],
+    reached: dict[AgentIdentity, AgentScore],
+) -> list[dict[str, Any]]:
+    """Return the rows of verified entries, in order, and note the results of those that are ranked."""
+    from lag_envs.evaluation.statistics import ends, iqm, rounded_data
+    from lag_envs.leaderboard import ranking
+    from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
+
+    scale, reference = told.scales[env_id], told.references.get(env_id)
+    scores = {id: ranking.scored(scale, reference, r["policies"]) for id, r in found.items()}
+    drawn = {id: ranking.redrawn(id, each) for id, each in scores.items()}
+    first = {id: state.first(entries[id]) for id in found}
+    # Rows that act like an earlier one are shown, but are not ranked, and no row is compared with them.
+    places = ranking.ranked({id: each for id, each in scores.items() if first[id] is None}, drawn)
+    ranks = {place.id: place for place in places}
+    rows = []
+    for id in sorted(scores, key=lambda id: -float(iqm(scores[id].table.mean(axis=1)))):
+        entry, result, place = entries[id], found[id], ranks.get(id)
+        like = first[id]
+        row: dict[str, Any] = {
+            "id": id,
+            "rank": place and place.rank,
+            "above": place and place.above and list(place.above),
+            "alike": like and {"id": like.id, "name": like.name, "state": like.state},
+            "reference": scores[id].own,
+            "looks_like": _looks_like(entry, entries.values()),
+            "name": entry.name,
+            "kind": entry.kind,
+            "authors": list(entry.authors),
+            "state": entry.state,
+            "added": entry.added[:10],
+        }
+        row |= result["claimed"]
+        row["curves"] = [
+            {
+                "seed": c["seed"], "steps": c["steps"],
+                "scores": normalised(scale, c["returns"]).tolist(),
+            }
+            for c in result["claimed"]["curves"]
+        ]  # fmt: skip
+        row |= ranking.columns(env_id, result, told.rules.disturbed_episodes, scale, scores[id])
+        samples = iqm(drawn[id])
+        row["interval"] = list(ends(samples))
+        if place is not None:
+            agent = AgentIdentity(entry.name, tuple(entry.authors))
+            reached[agent] = AgentScore(row["score"], samples, entry.kind)
+        rows.append(rounded_data(row) | {"replays": _replays(result, scale)})
+    return rows
+
+
+def _replays(result: Mapping[str, Any], scale: LoggedScale) -> list[dict[str, Any]]:
+    """Return the recorded episodes of a result, with their scores."""
+    from lag_envs.evaluation.statistics import rounded_data
+
+    middle, chosen = shown_episodes(result)
+    verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
+    # States, actions and rewards are stored rounded.
+    return [
+        replay
+        | rounded_data({"return": replay["return"], "score": normalised(scale, replay["return"])})
+        | {"t0": 0.0}
+        for replay in result["replays"]
+        # Under protocol 1, the episodes of random actions were different ones.
+        if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
+    ]
 
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:

@@ -148,6 +148,24 @@ def write_page(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     store.write_file(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
 
 
+class Assets:
+    """Files that pages refer to: content by path."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, str | bytes] = {}
+
+    def keep(self, stem: str, kind: str, content: str | bytes) -> str:
+        """Keep a file, and return its path, whose hash covers the content."""
+        found = hashlib.sha256(content.encode() if isinstance(content, str) else content)
+        name = f"assets/{stem}-{found.hexdigest()[:10]}.{kind}"
+        self.files[name] = content
+        return name
+
+    def keep_data(self, stem: str, value: Any) -> str:
+        """Keep data as a script that hands it to the page's own."""
+        return self.keep(stem, "js", f"lagEnvs.put({page_json(value)});\n")
+
+
 def render(
     data: Mapping[str, Any],
     url: str = "",
@@ -163,47 +181,14 @@ def render(
     """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
-    files: dict[str, str | bytes] = {}
-
-    def keep(stem: str, kind: str, content: str | bytes) -> str:
-        found = hashlib.sha256(content.encode() if isinstance(content, str) else content)
-        name = f"assets/{stem}-{found.hexdigest()[:10]}.{kind}"
-        files[name] = content
-        return name
-
-    def keep_data(stem: str, value: Any) -> str:
-        return keep(stem, "js", f"lagEnvs.put({page_json(value)});\n")
-
-    style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
-    script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
-    scheme = documentation and keep("scheme", "js", (STATIC / "scheme.js").read_text("utf-8"))
+    assets, taken = Assets(), {"index"}
+    style = assets.keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
+    script = assets.keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
+    scheme = documentation and assets.keep("scheme", "js", (STATIC / "scheme.js").read_text("utf-8"))
     parts = "\n".join((STATIC / f"{name}.js").read_text("utf-8") for name in ("episode", "drive"))
-    drive = keep("drive", "js", f'"use strict";\n(() => {{\n{parts}}})();\n')
-    boards, taken = [], {"index"}
-    for given in tqdm(data["environments"], "drawing", unit=" environments", disable=None, leave=False):
-        scenery = Scenery(str(given["id"]))
-        board = _board(_clean(given), data["protocol"], scenery)
-        board["page"] = _unused(board["page"], taken)
-        code = None if board["frozen"] else driving.script(str(given["id"]))
-        board["code"] = code and keep(f"{board['page']}-drive", "js", code)
-        board["film"] = None
-        for i, row in enumerate(board["rows"]):
-            own = str(row["id"] or row["name"]).removeprefix(f"{board['id']}-")
-            row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
-            replays, live = row.pop("replays"), row.pop("agent")
-            row["file"] = None
-            row["live"] = keep_data(f"{board['page']}-{i}-live", live) if live and code else None
-            if replays:
-                # The script that fetches the file knows it by this key.
-                episodes = [scenery.episode(replay) for replay in replays]
-                row["file"] = keep_data(f"{board['page']}-{i}", episodes)
-                if row["name"] == board["shown"] and not board["film"]:
-                    board["film"] = keep_data(f"{board['page']}-film", episodes[:1])
-        states, target = board.pop("states"), board.pop("goal_of_states")
-        preview = scenery.preview(states, target) if url else None
-        board["preview"] = preview and keep(board["page"], "png", preview)
-        boards.append(board)
-
+    drive = assets.keep("drive", "js", f'"use strict";\n(() => {{\n{parts}}})();\n')
+    given = tqdm(data["environments"], "drawing", unit=" environments", disable=None, leave=False)
+    boards = [_drawn(one, data["protocol"], assets, taken, bool(url)) for one in given]
     templates = Environment(
         loader=PackageLoader("lag_envs.leaderboard.site"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
@@ -241,7 +226,35 @@ def render(
     )  # fmt: skip
     page("feed.xml", "feed.xml", entries=news[:NEWS])
     page("index.html", "index.html", title="Overview", about=ABOUT, now="index", summary=summary)
-    return pages, files
+    return pages, assets.files
+
+
+def _drawn(
+    given: Mapping[str, Any], protocol: Any, assets: Assets, taken: set[str], preview: bool
+) -> dict[str, Any]:
+    """Return an environment's data for the templates, and keep the files that its pages fetch."""
+    scenery = Scenery(str(given["id"]))
+    board = _board(_clean(given), protocol, scenery)
+    board["page"] = _unused(board["page"], taken)
+    code = None if board["frozen"] else driving.script(str(given["id"]))
+    board["code"] = code and assets.keep(f"{board['page']}-drive", "js", code)
+    board["film"] = None
+    for i, row in enumerate(board["rows"]):
+        own = str(row["id"] or row["name"]).removeprefix(f"{board['id']}-")
+        row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
+        replays, live = row.pop("replays"), row.pop("agent")
+        row["file"] = None
+        row["live"] = assets.keep_data(f"{board['page']}-{i}-live", live) if live and code else None
+        if replays:
+            # The script that fetches the file knows it by this key.
+            episodes = [scenery.episode(replay) for replay in replays]
+            row["file"] = assets.keep_data(f"{board['page']}-{i}", episodes)
+            if row["name"] == board["shown"] and not board["film"]:
+                board["film"] = assets.keep_data(f"{board['page']}-film", episodes[:1])
+    states, target = board.pop("states"), board.pop("goal_of_states")
+    image = scenery.preview(states, target) if preview else None
+    board["preview"] = image and assets.keep(board["page"], "png", image)
+    return board
 
 
 def _slug(text: str) -> str:
