@@ -22,14 +22,10 @@ def of_energies(sizes: Sequence[int]) -> list[Contestant]:
     # Batches of thousands of long chains would take minutes until their episodes are staggered.
     middle = max((n for n in sizes if n <= 1024), default=min(sizes))
     exact = next(task for task in TASKS.values() if task.peer == "CartPole-v1")
-    some: list[tuple[str, type[Task], dict[str, Any], int]]
-    some = [("CartPole, exact", exact, {}, n) for n in sizes]
-    some += [("Chain(2)", ChainSwing, {"bars": 2}, n) for n in sizes]
-    some += [(f"Chain({i})", ChainSwing, {"bars": i}, middle) for i in (1, *range(3, LONGEST + 1))]
-    return [
-        Contestant(ENERGIES, id, "vector", n, partial(energies, task, given, n))
-        for id, task, given, n in some
-    ]
+    chains = [(2, n) for n in sizes] + [(bars, middle) for bars in (1, *range(3, LONGEST + 1))]
+    some = [("CartPole, exact", n, partial(energies, exact, {}, n)) for n in sizes]
+    some += [(f"Chain({bars})", n, partial(energies, ChainSwing, {"bars": bars}, n)) for bars, n in chains]
+    return [Contestant(ENERGIES, id, "vector", n, prepare) for id, n, prepare in some]
 
 
 def energies(task: type[Task], given: dict[str, Any], n: int) -> Run:

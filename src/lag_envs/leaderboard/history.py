@@ -36,9 +36,6 @@ class Finding:
     open: str = ""
 
 
-# --- the pin -----------------------------------------------------------------------------------------------
-
-
 class Pin(Strict):
     """The head of a log's chain: its number of lines, the hash of the first line, and that of all of them."""
 
@@ -85,9 +82,6 @@ def pinned(board: Board, log: bytes, file: Path | None) -> Finding:
     else:
         found.told = f"the first {pin.lines} lines are those that {path.name} pins"
     return found
-
-
-# --- the repository ----------------------------------------------------------------------------------------
 
 
 class NoHistory(Exception):

@@ -16,6 +16,7 @@ from lag_envs.scores import KnownReturns, known_returns, normalised
 from lag_envs.tasks import TASKS
 
 if TYPE_CHECKING:
+    from lag_envs.leaderboard.checks import Results
     from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
 
 #: Modules of the project's own agents whose frozen submissions name no code, by how their descriptions begin.
@@ -90,13 +91,9 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
 
 
 def _environment(
-    board: Board,
-    state: BoardState,
-    results: Mapping[tuple[int, str], dict[str, Any]],
-    env_id: str,
-    number: int,
+    board: Board, state: BoardState, results: Results, env_id: str, number: int,
     reached: dict[AgentIdentity, AgentScore],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Return a board, and note the results of its ranked agents."""
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
     told = state.protocols.get(number)
@@ -122,13 +119,9 @@ def _environment(
 
 
 def _rows(
-    env_id: str,
-    told: Protocol,
-    state: BoardState,
-    entries: Mapping[str, BoardEntry],
-    found: Mapping[str, dict[str, Any]],
-    reached: dict[AgentIdentity, AgentScore],
-) -> list[dict[str, Any]]:
+    env_id: str, told: Protocol, state: BoardState, entries: Mapping[str, BoardEntry],
+    found: Mapping[str, dict[str, Any]], reached: dict[AgentIdentity, AgentScore],
+) -> list[dict[str, Any]]:  # fmt: skip
     """Return the rows of verified entries, in order, and note the results of those that are ranked."""
     from lag_envs.evaluation.statistics import ends, iqm, rounded_data
     from lag_envs.leaderboard import ranking
@@ -160,12 +153,9 @@ def _rows(
         }
         row |= result["claimed"]
         row["curves"] = [
-            {
-                "seed": c["seed"], "steps": c["steps"],
-                "scores": normalised(scale, c["returns"]).tolist(),
-            }
+            {"seed": c["seed"], "steps": c["steps"], "scores": normalised(scale, c["returns"]).tolist()}
             for c in result["claimed"]["curves"]
-        ]  # fmt: skip
+        ]
         row |= ranking.columns(env_id, result, told.rules.disturbed_episodes, scale, scores[id])
         samples = iqm(drawn[id])
         row["interval"] = list(ends(samples))

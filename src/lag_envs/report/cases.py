@@ -35,26 +35,15 @@ class Variant(NamedTuple):
 VARIANTS = {
     variant.name: variant
     for variant in (
-        Variant(
-            "PivotedBar", PivotedBar, {"damping": 0.001, "track": None},
-            0.02, (math.pi, 12), (-5, 5), (2.0, 3.0), 3.0, typical=True,
-        ),
-        Variant(
-            "Incline, drag", Incline, {"tilt": math.pi / 12},
-            0.02, (3, 3), (0, 6), (0.5, 2.0), 0.0,
-        ),
-        Variant(
-            "Incline, moving", Incline, {"damping": 0.03, "control": "tilt_rate"},
-            0.05, (0.5, 1, 0.1), (-0.3, 0.3), (0.25, 1.0, 0.125), 0.25, typical=True,
-        ),
-        Variant(
-            "CylinderInCylinder, drag", CylinderInCylinder, {"control": "damping"},
-            0.02, (1.3, 5), (0, 2.4), (1.0, 3.0), 0.0,
-        ),
-        Variant(
-            "CylinderInCylinder, tilt", CylinderInCylinder, {"damping": 0.024},
-            0.05, (1.3, 5, 6), (-15, 15), (1.0, 3.0, 1.0), 3.0, typical=True,
-        ),
+        Variant("PivotedBar", PivotedBar, {"damping": 0.001, "track": None}, 0.02,
+                (math.pi, 12), (-5, 5), (2.0, 3.0), 3.0, typical=True),
+        Variant("Incline, drag", Incline, {"tilt": math.pi / 12}, 0.02, (3, 3), (0, 6), (0.5, 2.0), 0.0),
+        Variant("Incline, moving", Incline, {"damping": 0.03, "control": "tilt_rate"}, 0.05,
+                (0.5, 1, 0.1), (-0.3, 0.3), (0.25, 1.0, 0.125), 0.25, typical=True),
+        Variant("CylinderInCylinder, drag", CylinderInCylinder, {"control": "damping"}, 0.02,
+                (1.3, 5), (0, 2.4), (1.0, 3.0), 0.0),
+        Variant("CylinderInCylinder, tilt", CylinderInCylinder, {"damping": 0.024}, 0.05,
+                (1.3, 5, 6), (-15, 15), (1.0, 3.0, 1.0), 3.0, typical=True),
     )
 }  # fmt: skip
 #: The variant of quick reports, and of measurements that are made on a single one.

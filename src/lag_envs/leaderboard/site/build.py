@@ -280,24 +280,10 @@ def _about(row: Mapping[str, Any], board: Mapping[str, Any]) -> str:
 def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, Any]:
     """Return an environment's data for the templates and the script."""
     board: dict[str, Any] = {
-        "known": None,
-        "value": None,
-        "other": [],
-        "goal": None,
-        "picture": None,
-        "frozen": False,
-        "state_names": [],
-        "state_units": [],
-        "pairs": [],
-        "controls": [],
-        "dt": None,
-        "scene": "",
-        "title": given["id"],
-        "about": [],
-        "difficulty": "",
-        "open": None,
-        "drives": [],
-    }
+        "known": None, "value": None, "other": [], "goal": None, "picture": None, "frozen": False,
+        "state_names": [], "state_units": [], "pairs": [], "controls": [], "dt": None, "scene": "",
+        "title": given["id"], "about": [], "difficulty": "", "open": None, "drives": [],
+    }  # fmt: skip
     board |= {"protocol": protocol} | given | scenery_data(given["id"])
     board["rows"] = [_row(dict(row)) for row in given["rows"]]
     known = board["known"] or {}
