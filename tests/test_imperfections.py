@@ -16,8 +16,8 @@ from covering import slow
 import lag_envs
 from lag_envs import replay
 from lag_envs.envs import program as program_module
+from lag_envs.envs.imperfect.constants import constants_of
 from lag_envs.envs.imperfect.draws import PURPOSES
-from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.imperfect.whole import WholeProgram
 from lag_envs.envs.program import Program
@@ -161,8 +161,8 @@ def test_what_is_off_leaves_everything_as_it_is():
     for keywords in (NEUTRAL, dict.fromkeys(KEYWORDS)):
         task = make_task(ID, **keywords)
         assert task.imperfections is None
-        assert numbers_of(task) == plain.formulas.constants()
-        program = program_of(task, [numbers_of(task)])
+        assert constants_of(task) == plain.formulas.constants()
+        program = program_of(task, [constants_of(task)])
         assert type(program) is Program and program is program_of(plain, [plain.formulas.constants()])
 
 

@@ -71,9 +71,9 @@ def operations(scene):
 
 def advance_of(scene, dt):
     """Return the scene's compiled step, and its arguments after state, control and step."""
-    numbers = motion_constants_of(scene)
-    code = form_of(scene).code(dt, absent_from(numbers))
-    return code.compile(), [form_of(scene).largest_majorant(dt), *(v for v in numbers.values() if v)]
+    constants = motion_constants_of(scene)
+    code = form_of(scene).code(dt, absent_from(constants))
+    return code.compile(), [form_of(scene).largest_majorant(dt), *(v for v in constants.values() if v)]
 
 
 # --- certified steps ---

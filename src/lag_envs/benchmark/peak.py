@@ -15,7 +15,7 @@ import numpy as np
 
 from lag_envs.benchmark.results import quartiles, ratios
 from lag_envs.benchmark.rounds import CORE, Contestant
-from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.constants import constants_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
@@ -73,7 +73,7 @@ def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
         count = None
         if row.rates:
             task: Any = gym.make_vec(id, num_envs=1).unwrapped.task  # type: ignore[attr-defined]
-            count = products(program_of(task, [numbers_of(task)]))
+            count = products(program_of(task, [constants_of(task)]))
         if count and (pairs := ratios(row.rates, limits)):
             share = quartiles([count * pair for pair in pairs])
             found.append({"id": id, "num_envs": row.num_envs, "products": count, "share": share})

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.constants import constants_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.interface import (
     FLOAT32,
@@ -105,7 +105,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._plain = not self._actions.values and self._actions.count == 1
         self.observation_space = observation_space([self.task])
 
-        constants = numbers_of(self.task)
+        constants = constants_of(self.task)
         self._program = program = program_of(self.task, [constants])
         rows = program.kept + program.scratch
         numbers = [constants[name] for name in program.uniform]
@@ -376,7 +376,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         held = self._read(program.held)
         if program.tries_all:
             raise self._refusal(held)
-        constants = numbers_of(self.task)
+        constants = constants_of(self.task)
         constants |= {name: rows[self._row[f"k_{name}"]] for name in program.varying}
         numbers = (constants[name] for name in program.advance_constants)
         *end, status = program.advance(*self._read(program.y), *held, self.task.dt, constants["x"], *numbers)
@@ -405,5 +405,5 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the pickled state, and compile again (from the cache)."""
         self.__dict__.update(state)
-        self._program = program_of(self.task, [numbers_of(self.task)])
+        self._program = program_of(self.task, [constants_of(self.task)])
         self._bind()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs import sharing, snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.constants import constants_of
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.interface import (
     FLOAT32,
@@ -140,13 +140,13 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
-        numbers = {id(task): numbers_of(task) for task in {id(t): t for t in self.tasks}.values()}
-        self._constants = [dict(numbers[id(task)]) for task in self.tasks]
+        constants = {id(task): constants_of(task) for task in {id(t): t for t in self.tasks}.values()}
+        self._constants = [dict(constants[id(task)]) for task in self.tasks]
         endless = type(max_episode_steps) is int and max_episode_steps == -1  # Gymnasium's word for it
         if max_episode_steps is not None and not endless:
             steps = float(check_count("max_episode_steps", max_episode_steps))
-            for constants in self._constants:
-                constants["limit"] = min(constants["limit"], steps)
+            for own in self._constants:
+                own["limit"] = min(own["limit"], steps)
         self._limit = self._constants[0]["limit"]
         self._compile()
         program = self._program

@@ -285,22 +285,22 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
 
     motion_constants_of(scene)  # for its errors
     mechanics = mechanics_with(scene, by)
-    form, numbers = normal_form(mechanics, chosen_order_of(scene)), parameter_values(scene)
+    form, parameters = normal_form(mechanics, chosen_order_of(scene)), parameter_values(scene)
     try:
         if form:
-            constants, rates = form.constants(numbers), form.rates(numbers, by)
+            constants, rates = form.constants(parameters), form.rates(parameters, by)
             known[by] = _Derivatives(
                 lambda y, u, dt: form.jacobian(y, u, constants, dt, rates, len(by)),
                 lambda y, u, dt, seeds: form.vjp(y, u, constants, dt, seeds, rates, len(by)),
             )
         else:
-            tangent = stepper_of(mechanics).tangent(numbers, by)
+            tangent = stepper_of(mechanics).tangent(parameters, by)
             known[by] = _Derivatives(
                 lambda y, u, dt: tangent.jacobian(y, u, dt, series_order_of(scene, dt)),
                 lambda y, u, dt, seeds: tangent.vjp(y, u, dt, series_order_of(scene, dt), seeds),
             )
     except (ArithmeticError, ValueError) as error:
-        given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
+        given = ", ".join(f"{name}={parameters[name]:g}" for name in by)
         raise ValueError(
             f"the motion has no derivative with respect to the parameters at {given}; leave out parameters "
             "that are 0 if a formula divides by them or takes their root"

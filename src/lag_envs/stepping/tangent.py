@@ -27,7 +27,7 @@ class SeriesTangent:
         The scene's stepper.
     record : SeriesRecord
         The record of the step, made with tangents.
-    constants, numbers : mapping from str to float
+    constants, parameters : mapping from str to float
         Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
     by : tuple of str
         Parameters with respect to which derivatives are taken, besides state and controls.
@@ -38,12 +38,12 @@ class SeriesTangent:
         stepper: SeriesStepper,
         record: SeriesRecord,
         constants: Mapping[str, float],
-        numbers: Mapping[str, float],
+        parameters: Mapping[str, float],
         by: tuple[str, ...],
     ) -> None:
         from lag_envs.stepping.machine import slots_for
 
-        self._stepper, self._numbers, self._given, self._by = stepper, numbers, record.given, by
+        self._stepper, self._parameters, self._given, self._by = stepper, parameters, record.given, by
         self._record = record
         n = record.size
         seen = {(node.op, node.index) for node in record.nodes}
@@ -85,11 +85,11 @@ class SeriesTangent:
         """
         count, size, first = len(states), len(self._moving) // 2, len(self._given)
         xp = VariableFunctions()
-        numbers = [self._numbers.get(f"p_{name}", 0.0) for name in self._by]
+        numbers = [self._parameters.get(f"p_{name}", 0.0) for name in self._by]
         y, u, p = variables_of(states, controls, np.broadcast_to(numbers, (count, len(numbers))))
         moved = {f"parameter_{name}": number for name, number in zip(self._by, p, strict=True)}
         changed = {f"p_{name}": number for name, number in zip(self._by, p, strict=True)}
-        k: dict[str, Any] = {name: changed.get(name, x) for name, x in self._numbers.items()}
+        k: dict[str, Any] = {name: changed.get(name, x) for name, x in self._parameters.items()}
         before = self._stepper.prepare(xp, y, u, k) | moved
         values = np.empty((count, first + 2 * size))
         values[:, :first] = self._constants
@@ -164,7 +164,7 @@ class SeriesTangent:
                 for n in (moving, len(layout.state), len(self._stepper.arguments), len(self._by))
             )
         )
-        before = self._stepper.prepare(xp, y, u, self._numbers)
+        before = self._stepper.prepare(xp, y, u, self._parameters)
         before |= {f"parameter_{name}": x for name, x in zip(self._by, p, strict=True)}
 
         def by_start(names: Sequence[str]) -> Any:
@@ -175,7 +175,7 @@ class SeriesTangent:
             return found[:, moving:]
 
         q, v = ends[: moving // 2], ends[moving // 2 :]
-        by_end = stacked(self._stepper.finish(xp, q, v, y, u, dt, self._numbers), 1)[0]
+        by_end = stacked(self._stepper.finish(xp, q, v, y, u, dt, self._parameters), 1)[0]
         constants = np.concatenate([self._constants, np.zeros(moving)])
         starts = by_start([*self._given, *self._moving])[:, : len(y) + len(u)]
         parts = constants, starts, by_start([*self._moving, *self._sources]), by_end

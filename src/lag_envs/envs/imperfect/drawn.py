@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from lag_envs.envs.imperfect.constants import constants_of
 from lag_envs.envs.imperfect.derived import DerivedConstants
 from lag_envs.envs.imperfect.draws import purpose_key
-from lag_envs.envs.imperfect.numbers import numbers_of
 from lag_envs.envs.imperfect.pushes import pushes
 from lag_envs.envs.program import Program
 from lag_envs.tasks.base import Task
@@ -28,7 +28,7 @@ class DrawnProgram(Program):
         self.asked = [f"asked{i}" for i in range(len(self.options.lag))]
         self.own = [*self.p, *self.own, *self.asked]
         self._source = task.drawn.inner if task.drawn else task
-        super().__init__(self._source, absent, varying | frozenset(changed), list(numbers_of(task)))
+        super().__init__(self._source, absent, varying | frozenset(changed), list(constants_of(task)))
         self.drawn = [*self.p, *(f"k_{name}" for name in self.varying if name in changed)]
 
     @property
