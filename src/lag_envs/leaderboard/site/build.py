@@ -188,7 +188,7 @@ def render(
     parts = "\n".join((STATIC / f"{name}.js").read_text("utf-8") for name in ("episode", "drive"))
     drive = assets.keep("drive", "js", f'"use strict";\n(() => {{\n{parts}}})();\n')
     given = tqdm(data["environments"], "drawing", unit=" environments", disable=None, leave=False)
-    boards = [_drawn(one, data["protocol"], assets, taken, bool(url)) for one in given]
+    boards = [_board_with_files(one, data["protocol"], assets, taken, bool(url)) for one in given]
     templates = Environment(
         loader=PackageLoader("lag_envs.leaderboard.site"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
@@ -229,7 +229,7 @@ def render(
     return pages, assets.files
 
 
-def _drawn(
+def _board_with_files(
     given: Mapping[str, Any], protocol: Any, assets: Assets, taken: set[str], preview: bool
 ) -> dict[str, Any]:
     """Return an environment's data for the templates, and keep the files that its pages fetch."""
