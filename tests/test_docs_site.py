@@ -26,7 +26,6 @@ LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "vide
 NAMED = {"canonical", "next", "prev", "alternate"}
 
 pytestmark = [
-    pytest.mark.slow,  # it builds the whole site
     pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM"),
     # MkDocs and its plugins are third-party code.
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
@@ -54,7 +53,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """Build the site as `make docs` does."""
+    """Build the site as `make docs` does; that takes long, so only its links are checked each time."""
     folder = tmp_path_factory.mktemp("docs")
     os.environ["NO_MKDOCS_2_WARNING"] = "1"
     config = load_config(str(ROOT / "mkdocs.yml"), site_dir=str(folder), strict=True)
@@ -70,6 +69,7 @@ def pages(site):
     return {name: Page(path.read_text("utf-8")) for name, path in found.items()}
 
 
+@pytest.mark.slow
 def test_every_page_is_there(site, pages):
     for env_id in TASKS:
         assert {f"environments/{env_id}.html", f"board/{env_id}.html"} <= set(pages)
@@ -83,6 +83,7 @@ def test_every_page_is_there(site, pages):
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
 
 
+@pytest.mark.slow
 def test_minus_signs_and_pictures_of_a_long_page(site):
     text = (site / "agents.html").read_text("utf-8")
     assert "random actions −1266.5" in text and "gravity −20 %" in text
@@ -90,6 +91,7 @@ def test_minus_signs_and_pictures_of_a_long_page(site):
     assert article.count("<img ") - article.count('<img loading="lazy" ') == 1
 
 
+@pytest.mark.slow
 def test_titles_and_previews(site, pages):
     """Each page has a title of its own, and says what a shared link shows."""
     texts = {name: (site / name).read_text("utf-8") for name in pages}
@@ -115,6 +117,7 @@ def test_titles_and_previews(site, pages):
         assert f'og:description" content="{escape(TASKS[env_id].__doc__.partition(chr(10))[0])}"' in head
 
 
+@pytest.mark.slow
 def test_lists_of_pages(site):
     """Sitemap and feed name the board, and a page that is missing leads home."""
     places = (site / "sitemap.xml").read_text("utf-8")
@@ -127,6 +130,7 @@ def test_lists_of_pages(site):
     assert "To the home page</a>" in (site / "404.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_one_navigation(pages):
     """From each page to every section, and from the board back."""
     sections = [next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]]
@@ -140,6 +144,7 @@ def text_of(name):
     return re.sub(r"!!python\S+", "", (ROOT / name).read_text("utf-8"))
 
 
+@pytest.mark.slow
 def test_nothing_comes_from_another_host(site, pages):
     for name, page in pages.items():
         for address in page.loads:
@@ -162,6 +167,7 @@ def test_links_lead_somewhere(site, pages):
                 assert unquote(parts.fragment) in pages[place].anchors, (name, link)
 
 
+@pytest.mark.slow
 def test_what_is_bundled_is_noticed(site):
     """NOTICE.md covers each third-party script and style."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
@@ -176,6 +182,7 @@ def test_what_is_bundled_is_noticed(site):
     assert not list(site.rglob("*.woff*")) and not list(site.rglob("*.ttf"))
 
 
+@pytest.mark.slow
 def test_formulas_are_whole(site):
     """Each element has the required number of parts, and each formula includes its LaTeX."""
     parts = {"msup": 2, "msub": 2, "mfrac": 2, "mover": 2, "msubsup": 3}
@@ -209,6 +216,7 @@ def test_pages_are_published_only_when_switched_on():
 # --- in a browser, from files, without a server ---
 
 
+@pytest.mark.slow
 def test_in_a_browser(site, browser):
     """No page requests anything outside its folder, search works offline, and pages fit a narrow screen."""
     asked = []
@@ -241,6 +249,7 @@ BROKEN = r"""[...document.querySelectorAll('td code')].flatMap(({ firstChild: te
 })"""
 
 
+@pytest.mark.slow
 def test_code_and_formulas_are_readable(site, browser):
     """Tables keep the words of code whole, and only single terms are wider than the page."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
@@ -255,6 +264,7 @@ def test_code_and_formulas_are_readable(site, browser):
     page.close()
 
 
+@pytest.mark.slow
 def test_pictures_can_stand_still(site, browser):
     for motion in ("reduce", "no-preference"):
         page = browser.new_page(reduced_motion=motion)
@@ -268,6 +278,7 @@ def test_pictures_can_stand_still(site, browser):
         page.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280])
 def test_axe_finds_nothing_serious(site, browser, scheme, width):
