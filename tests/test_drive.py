@@ -26,6 +26,23 @@ from lag_envs.tasks import TASKS, cart_pole, cylinder_in_cylinder, incline, pivo
 from tests import board_pages
 
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
+#: How many numbers of the read-out are painted, and how many are text.
+PAINTED = """(() => {
+    const canvas = document.querySelector('.values');
+    const { top, left } = canvas.getBoundingClientRect();
+    const { width, height } = canvas;
+    const copy = Object.assign(document.createElement('canvas'), { width, height });
+    const pen = copy.getContext('2d', { willReadFrequently: true });
+    pen.drawImage(canvas, 0, 0);
+    const [painted, written] = [[], []];
+    for (const cell of document.querySelectorAll('.driver .readout dd')) {
+        const box = cell.getBoundingClientRect();
+        const part = [box.left - left, box.top - top, box.width, box.height];
+        painted.push(pen.getImageData(...part).data.some(Boolean));
+        written.push(getComputedStyle(cell).visibility === 'visible');
+    }
+    return [painted, written].map((each) => each.filter(Boolean).length);
+})()"""
 
 
 def test_by_keys_alone(drive, capsys):
@@ -42,6 +59,8 @@ def test_by_keys_alone(drive, capsys):
     page.keyboard.down("ArrowRight")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
     until(page, readout("Time"), lambda text: text > "0.1")
+    numbers, written = page.evaluate(PAINTED)
+    assert numbers > 5 and not written
     page.keyboard.up("ArrowRight")
     # A key that is tapped between two steps acts on the next one.
     page.keyboard.press("ArrowLeft")
@@ -49,6 +68,7 @@ def test_by_keys_alone(drive, capsys):
     shows(page, "dφ/dt", "0.000 rad/s")
     page.keyboard.press("Space")
     assert message(page).startswith("Paused at 0.")
+    assert page.evaluate(PAINTED) == [0, numbers]
     held = link_of(page)
     assert replay.read_link(held).seed == 12
     known, limit = known_returns(incline.Tilt.id), incline.Tilt().limit

@@ -574,11 +574,10 @@ function open(root, board, code, tools) {
     if (!running || !width) return;
     writeList(spoken, told); // within the canvas, for those who do not see it
     const { fontSize, fontFamily, color } = getComputedStyle(readout.lastChild.lastChild);
-    [pen.font, pen.fillStyle] = [`${fontSize} ${fontFamily}`, color];
+    [pen.font, pen.fillStyle, pen.textBaseline] = [`${fontSize} ${fontFamily}`, color, "middle"];
     told.forEach(([, value], i) => {
-      const place = readout.children[i].lastChild;
-      const { fontBoundingBoxAscent: above, fontBoundingBoxDescent: below } = pen.measureText(value);
-      pen.fillText(value, place.offsetLeft, place.offsetTop + (place.offsetHeight + above - below) / 2);
+      const { offsetLeft, offsetTop, offsetHeight } = readout.children[i].lastChild;
+      pen.fillText(value, offsetLeft, offsetTop + offsetHeight / 2);
     });
   }
 
