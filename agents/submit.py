@@ -26,11 +26,12 @@ from lag_envs import TASKS
 from lag_envs.controllers import controllers
 from lag_envs.leaderboard.export import ExportError, export, find
 from lag_envs.leaderboard.protocol import LEARNED_POLICIES, boards
+from lag_envs.leaderboard.standings import OURS
 from lag_envs.leaderboard.submission import Refused, Submission, load, write
 from lag_envs.options import module_parser
 
 Array = NDArray[np.float64]
-AUTHORS, LICENSE = ["the lag_envs authors"], "MIT"
+AUTHORS, LICENSE = OURS, "MIT"
 #: The public address of this file's folder.
 CODE = "https://github.com/lag-envs/lag-envs/blob/main/agents/"
 

@@ -71,7 +71,7 @@ def frames(page, ghost=False, to_the_end=False):
         until(page, "document.querySelector('.go').textContent === 'Start again'")
         link_of(page)
     events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
-    # Text that changes in every frame would be laid out and painted, which takes longer than all scripts.
+    # Numbers that change are painted on a canvas, not laid out as text; a restart lays out some.
     layouts = sum(e["name"] == "Layout" for e in events)
     # The main thread's own time: the machine may be busy otherwise.
     took = np.array([e["tdur"] / 1e3 for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e])

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from lag_envs.envs.unfused import Unfused
+from lag_envs.leaderboard import standings
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import render, write_page
 from lag_envs.leaderboard.site.driving import sliders
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
-from lag_envs.leaderboard.standings import ORIGINS
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS, acrobot, cylinder_in_cylinder, incline, pendulum
 from tests import board_pages
@@ -156,11 +156,8 @@ def test_every_agent_of_the_board_has_a_link_to_its_code():
         tomllib.loads(file.read_text()) for file in root.glob("leaderboard/submissions/*/submission.toml")
     ]
     silent = [told for told in found if "code" not in told and told["policy"]["architecture"] != "controller"]
-    origins = [
-        [m for start, m in ORIGINS.items() if told["description"].startswith(start)] for told in silent
-    ]
-    assert silent and all(len(modules) == 1 for modules in origins)
-    assert all((root / site.place_of(module)).is_file() for module in ORIGINS.values())
+    assert silent and all(standings.origin(told["authors"], told["description"]) for told in silent)
+    assert all((root / site.place_of(module)).is_file() for module in standings.ORIGINS.values())
 
 
 def test_numbers_of_a_column_line_up():

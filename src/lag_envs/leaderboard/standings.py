@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from lag_envs.leaderboard.checks import Results
     from lag_envs.leaderboard.combined import AgentIdentity, AgentScore
 
-#: Modules of the project's own agents whose frozen submissions name no code, by how their descriptions begin.
+#: The authors of the project's own agents; some of their frozen submissions name no code.
+OURS = ("the lag_envs authors",)
+#: The modules of such agents, by how their descriptions begin.
 ORIGINS = {
     "agents.ppo, ": "agents.ppo",
     "Stable-Baselines3, ": "agents.learners",
@@ -43,10 +45,22 @@ def page_data(board: Board) -> dict[str, Any]:
             middle, _ = shown_episodes(board.result(results[row["id"]]))
             submission = load(board.submission(row["id"]))
             row["agent"] = agent(submission.policies[middle][1])
-            row["module"] = submission.architecture.module or next(
-                (module for start, module in ORIGINS.items() if submission.description.startswith(start)), ""
+            row["module"] = submission.architecture.module or origin(
+                submission.authors, submission.description
             )
     return data
+
+
+def origin(authors: Sequence[str], description: str) -> str:
+    """Return the module of one of the project's own agents, empty for another's.
+
+    Examples
+    --------
+    >>> origin(OURS, "agents.ppo, five seeds"), origin(["somebody"], "agents.ppo, five seeds")
+    ('agents.ppo', '')
+    """
+    found = (module for start, module in ORIGINS.items() if description.startswith(start))
+    return next(found, "") if tuple(authors) == OURS else ""
 
 
 def board_data(board: Board, made: str | None = None) -> dict[str, Any]:

@@ -503,6 +503,7 @@ function open(root, board, code, tools) {
 
   function label() {
     stage.toggleAttribute("data-driving", running);
+    readout.setAttribute("aria-hidden", running); // `spoken` replaces it
     for (const starts of [go, again, fresh]) starts.disabled = loading();
     go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
   }
@@ -567,12 +568,12 @@ function open(root, board, code, tools) {
     readOut(entries(ghostAt(part)));
   }
 
-  /** Write the numbers; while they change, paint them, for a browser lays out and paints text within milliseconds. */
+  /** Write the numbers. While they change they are painted, because laying out text takes a browser milliseconds. */
   function readOut(told) {
     const { pen, width } = cleared(values);
     if (!running || readout.children.length !== told.length) writeList(readout, told);
+    writeList(spoken, running ? told : []); // within the canvas, for those who do not see it
     if (!running || !width) return;
-    writeList(spoken, told); // within the canvas, for those who do not see it
     const { fontSize, fontFamily, color } = getComputedStyle(readout.lastChild.lastChild);
     [pen.font, pen.fillStyle, pen.textBaseline] = [`${fontSize} ${fontFamily}`, color, "middle"];
     told.forEach(([, value], i) => {
