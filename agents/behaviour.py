@@ -17,12 +17,12 @@ from agents.learners import LEARNERS, learner_label
 from agents.report import stored
 from agents.results import ROOT, write_envs
 from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
-from agents.submit import AUTHORS
 from lag_envs import TASKS
 from lag_envs.controllers import Constant, build
 from lag_envs.evaluation.rollout import Episodes, Rollout, record_rollout
 from lag_envs.evaluation.statistics import rounded_data
 from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.standings import OURS
 from lag_envs.leaderboard.submission import load
 from lag_envs.options import module_parser
 
@@ -68,7 +68,7 @@ def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
             yield name, [agent]
     board, names = Board(BOARD), {learner_label(algo): algo for algo in LEARNERS}
     for entry in sorted(board.read().entries.values(), key=lambda entry: entry.id):
-        own = entry.env == env_id and entry.kind == "learned" and list(entry.authors) == AUTHORS
+        own = entry.env == env_id and entry.kind == "learned" and tuple(entry.authors) == OURS
         if own and entry.state == "verified":
             yield (
                 names[entry.name],

@@ -31,7 +31,7 @@ from lag_envs.leaderboard.submission import Refused, Submission, load, write
 from lag_envs.options import module_parser
 
 Array = NDArray[np.float64]
-AUTHORS, LICENSE = OURS, "MIT"
+LICENSE = "MIT"
 #: The public address of this file's folder.
 CODE = "https://github.com/lag-envs/lag-envs/blob/main/agents/"
 
@@ -105,7 +105,7 @@ def optimal(env_id: str, folder: Path, cache: Path | None = DEFAULT_FOLDER) -> S
     policy, arrays = tabulate(solution)
     sizes = " x ".join(map(str, solution.programs[0].grid.shape))
     return write(
-        folder, env=env_id, name="optimal", authors=AUTHORS, license=LICENSE, policy=policy,
+        folder, env=env_id, name="optimal", authors=OURS, license=LICENSE, policy=policy,
         arrays={0: arrays},
         description=f"value iteration on {sizes} nodes, coarsened to a table; greedy one step ahead",
     )  # fmt: skip
@@ -121,7 +121,7 @@ def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
     origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
     module = OWN[algo][0].removeprefix("agents.") if algo in OWN else "learners"
     made, off, count = export(
-        find([runs]), folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
+        find([runs]), folder, env=env_id, name=name, authors=OURS, license=LICENSE,
         description=f"{origin}, with the hyperparameters that `lag-envs hyperparams` prints",
         code=f"{CODE}{module}.py",
     )  # fmt: skip
@@ -135,7 +135,7 @@ def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
 def controller(env_id: str, name: str, folder: Path) -> Submission:
     """Write a built-in controller as a submission."""
     return write(
-        folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
+        folder, env=env_id, name=name, authors=OURS, license=LICENSE,
         policy={"architecture": "controller", "name": name},
         description="built in, with its own numbers",
     )  # fmt: skip
