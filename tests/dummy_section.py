@@ -12,7 +12,7 @@ SECTION = "tests.dummy_section"
 
 
 def job(name, function="numbers", timeout=60.0, **arguments):
-    return ReportJob(SECTION, name, f"{SECTION}:{function}", arguments, timeout)
+    return ReportJob(globals()[function], name, arguments, timeout)
 
 
 def jobs(quick):

@@ -347,7 +347,7 @@ def test_subjects_are_the_scenes_of_tasks_and_the_others(write):
     assert len(own.subjects(write(SCENE + broken, "half.py"), told.append)) == 1
     assert len(told) == 1 and "left out: Broken: Broken.kinetic" in told[0]
     jobs = own.jobs(True, path)
-    assert all(callable(getattr(own, job.function.rpartition(":")[2])) for job in jobs)
+    assert all(job.section == "own" and getattr(own, job.function.__name__) is job.function for job in jobs)
     names = [job.name for job in jobs]
     assert names == [
         f"{what}: {name}" for what in ("steps", "stability", "points") for name in ("Swing of Pump", "Other")

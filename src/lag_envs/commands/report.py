@@ -60,7 +60,7 @@ def run_report(args: argparse.Namespace) -> int:
                 )
         # Errors in the file are reported before anything is measured.
         own.subjects(file, lambda text: print(text, file=sys.stderr))
-        names: tuple[str, ...] = (own.SECTION,)
+        names: tuple[str, ...] = ("own",)
     else:
         names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections is not None else SECTIONS
         for name in names:

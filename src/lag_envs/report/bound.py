@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from matplotlib.figure import Figure
 from mpmath import mp, mpf
 
 from lag_envs.report import reference
@@ -21,10 +22,6 @@ from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Coefficients
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-SECTION = "bound"
 ORDERS = (8, 12, 14, 16, 20)
 DIGITS = 100
 MORE = 80  # number of coefficients beyond the order that are summed as the truncation error
@@ -37,21 +34,17 @@ def jobs(quick: bool) -> list[ReportJob]:
     from lag_envs.tasks import TASKS
 
     parts, size = (2, 6) if quick else (6, 30)
-    found = [
-        ReportJob(SECTION, f"random drives {i + 1}", "bound:bound_points", {"n": size, "seed": i})
-        for i in range(parts)
-    ]
-    found += [
-        ReportJob(
-            SECTION, f"substeps {i + 1}", "bound:substeps_needed", {"n": 12 if quick else 50, "seed": i}
-        )
+    drives = [ReportJob(bound_points, f"random drives {i + 1}", {"n": size, "seed": i}) for i in range(parts)]
+    costs = [
+        ReportJob(substeps_needed, f"substeps {i + 1}", {"n": 12 if quick else 50, "seed": i})
         for i in range(1 if quick else 6)
     ]
     names = [name for name, task in TASKS.items() if task().certified_speed() is not None]
-    return found + [
-        ReportJob(SECTION, name, "bound:environment", {"id": name, "n": 6 if quick else 40})
+    ranges = [
+        ReportJob(environment, name, {"id": name, "n": 6 if quick else 40})
         for name in (names[:1] if quick else names)
     ]
+    return drives + costs + ranges
 
 
 # --- measuring ---
@@ -396,8 +389,6 @@ def _cell(value: Any) -> Any:
 
 
 def _draw_scatter(rows: Sequence[Row]) -> Figure:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(9, 4.6), layout="constrained")
     for axes, (name, sign, unit) in zip(figure.subplots(1, 2), QUANTITIES, strict=True):
         found = [(r[name], r[f"{name}_bound"], r["order"]) for r in rows if r[name]]
@@ -415,8 +406,6 @@ def _draw_scatter(rows: Sequence[Row]) -> Figure:
 
 
 def _draw_cost(rows: Sequence[Row]) -> Figure:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(6, 4.6), layout="constrained")
     axes = figure.subplots()
     places, counts = np.unique([(r["needed"], r["chosen"]) for r in rows], axis=0, return_counts=True)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lag_envs.report import reference
@@ -21,10 +23,6 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import motion_constants_of
 from lag_envs.stepping.compiling import compile_lines
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-SECTION = "conservation"
 COLOURS = {
     LAG_ENVS: "#000000",
     "RK4": "#0072b2",
@@ -67,18 +65,14 @@ def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: long free runs, and balances of driven, damped ones."""
     steps = QUICK_STEPS if quick else STEPS
     names = QUICK if quick else tuple(FREE)
-    made = [
-        ReportJob(
-            SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps}
-        )
+    runs = [
+        ReportJob(free, f"{name}, {method}", {"name": name, "method": method, "steps": steps})
         for name in names
         for method in (LAG_ENVS, *(m for m in METHODS if m in COLOURS))
     ]
     count = 50 if quick else 500
-    return made + [
-        ReportJob(
-            SECTION, f"balance, {name}", f"{SECTION}:energy_imbalance", {"variant": name, "steps": count}
-        )
+    return runs + [
+        ReportJob(energy_imbalance, f"balance, {name}", {"variant": name, "steps": count})
         for name in ([MAIN] if quick else VARIANTS)
     ]
 
@@ -284,39 +278,48 @@ def content(rows: list[Row], problems: list[JobResult]) -> Content:
 
 
 def _tables(drifts: list[Row], grown: list[Row], balances: list[Row]) -> list[Table]:
-    drift = [
-        (
-            row["name"],
-            row["method"],
-            row["steps"][-1] if row["steps"] else 0,
-            worst(row["energy"]),
-            exponent(row["steps"], row["energy"]) if row["steps"] else None,
-            worst(row.get("length", [])),
-            worst(row.get("pair", [])),
-        )
-        for row in drifts
-    ]
-    growth = [
-        (
-            row["name"],
-            row["seconds"][-1],
-            row["error"][-1],
-            row["amplified"][-1],
-            max(_ratios(row)),
-            exponent(row["seconds"], row["error"]),
-            exponent(row["seconds"], row["amplified"]),
-        )
-        for row in grown
-    ]
-    names = ("name", "steps", "largest", "sum", "energy", "turnover")
-    balance = [tuple(row[name] for name in names) for row in balances]
-    head = ("start", "method", "steps", "energy", "growth", "c² + s² - 1", "θ - angle of (c, s)")
-    units = ("largest of a step [J]", "sum [J]", "energy [J]", "work and loss [J]")
-    end = ("error", "amplified rounding", "largest ratio", "growth of error", "growth of rounding")
     return [
-        Table("conservation-drift", DRIFT, head, drift),
-        Table("conservation-growth", GROWTH, ("start", "time [s]", *end), growth),
-        Table("conservation-balance", BALANCE, ("scene", "steps", *units), balance),
+        Table.of(
+            "conservation-drift",
+            DRIFT,
+            {
+                "start": "name",
+                "method": "method",
+                "steps": lambda row: row["steps"][-1] if row["steps"] else 0,
+                "energy": lambda row: worst(row["energy"]),
+                "growth": lambda row: exponent(row["steps"], row["energy"]) if row["steps"] else None,
+                "c² + s² - 1": lambda row: worst(row.get("length", [])),
+                "θ - angle of (c, s)": lambda row: worst(row.get("pair", [])),
+            },
+            drifts,
+        ),
+        Table.of(
+            "conservation-growth",
+            GROWTH,
+            {
+                "start": "name",
+                "time [s]": lambda row: row["seconds"][-1],
+                "error": lambda row: row["error"][-1],
+                "amplified rounding": lambda row: row["amplified"][-1],
+                "largest ratio": lambda row: max(_ratios(row)),
+                "growth of error": lambda row: exponent(row["seconds"], row["error"]),
+                "growth of rounding": lambda row: exponent(row["seconds"], row["amplified"]),
+            },
+            grown,
+        ),
+        Table.of(
+            "conservation-balance",
+            BALANCE,
+            {
+                "scene": "name",
+                "steps": "steps",
+                "largest of a step [J]": "largest",
+                "sum [J]": "sum",
+                "energy [J]": "energy",
+                "work and loss [J]": "turnover",
+            },
+            balances,
+        ),
     ]
 
 
@@ -420,23 +423,31 @@ def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[ReportFigure]:
         )
 
 
-def _panels(names: Sequence[str]) -> tuple[Figure, dict[str, Any]]:
-    from matplotlib.figure import Figure
-
+def _panels(
+    rows: Sequence[Row], draw: Callable[[Axes, Row], object], x: str, y: str, legend_columns: int
+) -> Figure:
+    """Draw each row in the panel of its start; the first panel has all labels of the legend."""
+    names = sorted({row["name"] for row in rows}, key=list(FREE).index)
     columns = min(3, len(names))
     lines = -(-len(names) // columns)
     figure = Figure(figsize=(3.2 * columns, 2.6 * lines + 0.4), layout="constrained")
-    axes = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
-    for axis in axes[len(names) :]:
+    grid = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
+    for axis in grid[len(names) :]:
         axis.remove()
-    return figure, dict(zip(names, axes, strict=False))
+    axes = dict(zip(names, grid, strict=False))
+    for row in rows:
+        draw(axes[row["name"]], row)
+        axes[row["name"]].set_title(row["name"], fontsize=9)
+        axes[row["name"]].grid(alpha=0.3)
+    figure.supxlabel(x, fontsize=9)
+    figure.supylabel(y, fontsize=9)
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=legend_columns, fontsize=8)
+    return figure
 
 
 def _curves(rows: list[Row]) -> Figure:
-    names = list(dict.fromkeys(row["name"] for row in rows))
-    figure, axes = _panels(names)
-    for row in sorted(rows, key=lambda row: row["method"] == LAG_ENVS):
-        axis = axes[row["name"]]
+    def draw(axis: Axes, row: Row) -> None:
         values = np.array([np.nan if v is None else abs(v) for v in row["energy"]])
         values = np.fmax.accumulate(np.maximum(values, 1e-17)) if len(values) else values
         own = row["method"] == LAG_ENVS
@@ -444,19 +455,13 @@ def _curves(rows: list[Row]) -> Figure:
             row["steps"], values, color=COLOURS[row["method"]], lw=2.2 if own else 1.1, label=row["method"],
             zorder=3 if own else 2,
         )  # fmt: skip
-        axis.set_title(row["name"], fontsize=9)
         axis.set_ylim(1e-17, 1e3)
-        axis.grid(alpha=0.3)
-    figure.supxlabel("control steps", fontsize=9)
-    figure.supylabel("relative drift of energy", fontsize=9)
-    handles, labels = axes[names[0]].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=8)
-    return figure
+
+    ordered = sorted(rows, key=lambda row: row["method"] == LAG_ENVS)
+    return _panels(ordered, draw, "control steps", "relative drift of energy", 3)
 
 
 def _lengths(rows: list[Row]) -> Figure:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(6.4, 2.8), layout="constrained")
     axis = figure.subplots()
     for row, marker in zip(rows, "osD^vP", strict=False):
@@ -468,19 +473,12 @@ def _lengths(rows: list[Row]) -> Figure:
 
 
 def _growths(rows: list[Row]) -> Figure:
-    figure, axes = _panels([row["name"] for row in rows])
-    for row in rows:
-        axis = axes[row["name"]]
+    def draw(axis: Axes, row: Row) -> None:
         axis.loglog(
             row["seconds"], np.maximum(row["error"], 1e-18), color="black", lw=1.8, label="error of lag_envs"
         )
         axis.loglog(
             row["seconds"], row["amplified"], ":", color="#d55e00", lw=1.8, label="amplified rounding"
         )
-        axis.set_title(row["name"], fontsize=9)
-        axis.grid(alpha=0.3)
-    figure.supxlabel("time [s]", fontsize=9)
-    figure.supylabel("error [rad or m]", fontsize=9)
-    handles, labels = axes[rows[0]["name"]].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=8)
-    return figure
+
+    return _panels(rows, draw, "time [s]", "error [rad or m]", 2)

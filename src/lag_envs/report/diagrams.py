@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from lag_envs.report.points import HORIZONS, MODES, WorkPrecisionPoint
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Colours after Okabe and Ito; methods compiled by our machinery have solid lines, libraries dashed ones.
 STYLES = {
@@ -43,8 +42,6 @@ LOWEST = 1e-17
 
 def draw_variant(variant: str, points: Sequence[WorkPrecisionPoint], floor: Mapping[tuple, float]) -> Figure:
     """Draw one variant: horizons side by side, single states above, batches below."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10.5, 7.6), layout="constrained")
     here = [p for p in points if p.variant == variant]
     horizons = [h for h in HORIZONS if any(p.horizon == h for p in here)]

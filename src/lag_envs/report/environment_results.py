@@ -6,7 +6,8 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from statistics import median
-from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
 
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.episodes import DIGITS, TIMES
@@ -14,9 +15,6 @@ from lag_envs.report.runner import JobResult, Row
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Limits on the error of an exact flow's step and of its episode, and on that of any episode: a multiple of
 #: one rounding of its start, as amplified by the system, or the sum of the series' truncation errors.
@@ -311,8 +309,6 @@ def _curve(row: Row) -> tuple[list[float], list[float], list[float]]:
 
 
 def _draw_all(episodes: dict[str, list[Row]]) -> Figure:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8, 5.2), layout="constrained")
     axes = figure.add_subplot()
     named: set[str] = set()
@@ -332,8 +328,6 @@ def _draw_all(episodes: dict[str, list[Row]]) -> Figure:
 
 
 def _draw_each(episodes: dict[str, list[Row]]) -> Figure:
-    from matplotlib.figure import Figure
-
     columns = 3
     lines = -(-len(episodes) // columns)
     figure = Figure(figsize=(8, 0.6 + 1.75 * lines), layout="constrained")

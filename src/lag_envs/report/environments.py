@@ -36,7 +36,6 @@ from lag_envs.tasks.pivoted_bar import SwingUpFree
 
 __all__ = ["content", "jobs", "own_episode", "peer_episode", "undriven"]
 
-SECTION = "environments"
 #: Longest episode in control steps, as each is followed several times to more than 30 digits.
 MOST_STEPS = 1_000
 
@@ -47,20 +46,17 @@ def jobs(quick: bool) -> list[ReportJob]:
     seconds = 1.0 if quick else None
     made = [
         ReportJob(
-            SECTION, f"{id}, seed {seed}", "environments:own_episode",
-            {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())}, timeout=600.0,
+            own_episode,
+            f"{id}, seed {seed}",
+            {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())},
+            timeout=600.0,
         )
         for id, kind in TASKS.items()
         if not kind.imperfections  # the motion is the same as that of another id
         for seed in seeds
-    ]  # fmt: skip
+    ]
     made += [
-        ReportJob(
-            SECTION,
-            f"{id}, seed {seed}",
-            "environments:peer_episode",
-            {"id": id, "seed": seed, "seconds": seconds},
-        )
+        ReportJob(peer_episode, f"{id}, seed {seed}", {"id": id, "seed": seed, "seconds": seconds})
         for id in PEERS
         for seed in (seeds[:3] if id == "Acrobot-v1" else seeds)  # its episodes last 100 s
     ]
@@ -68,7 +64,7 @@ def jobs(quick: bool) -> list[ReportJob]:
     if not quick:
         free["lag_envs, undriven, dt 0.02 s"] = {"id": "", "dt": 0.02}
     free |= {f"{id}, undriven": {"id": id} for id in UNDRIVEN}
-    return made + [ReportJob(SECTION, name, "environments:undriven", given) for name, given in free.items()]
+    return made + [ReportJob(undriven, name, given) for name, given in free.items()]
 
 
 def longest(task: Task) -> float | None:

@@ -34,7 +34,6 @@ from lag_envs.stepping.general import series_code_of
 
 __all__ = ["attempts_and_bounds", "content", "jobs", "shares", "timed_rivals", "worst_and_median"]
 
-SECTION = "general"
 #: Copies of the states in a timed call.
 COPIES = 8
 #: Tolerances of heyoka and lag_envs. They lie closest together where an error used for comparison is just
@@ -84,46 +83,30 @@ def jobs(quick: bool) -> list[ReportJob]:
     families = [f for f in FAMILIES if not (quick and f == "pinocchio")]
     count = 8 if quick else MEMBERS
     made = [
-        ReportJob(
-            SECTION,
-            f"exact: {name}",
-            f"{SECTION}:exact_ends_of_systems",
-            {"name": name, "count": count},
-            900.0,
-        )
+        ReportJob(exact_ends_of_systems, f"exact: {name}", {"name": name, "count": count}, 900.0)
         for name in names
     ]
     made += [
-        ReportJob(
-            SECTION, f"model: {name}, {engine}", f"{SECTION}:models", {"name": name, "engine": engine}, 600.0
-        )
+        ReportJob(models, f"model: {name}, {engine}", {"name": name, "engine": engine}, 600.0)
         for name in names
         for engine in ENGINES
         if engine in families
     ]
+    states = count if quick else 1000
     made += [
-        ReportJob(
-            SECTION, f"certificate: {name}", f"{SECTION}:certificate",
-            {"name": name, "count": count if quick else 1000}, 300.0,
-        )
+        ReportJob(certificate, f"certificate: {name}", {"name": name, "count": states}, 300.0)
         for name in names
-    ]  # fmt: skip
-    made.append(ReportJob(SECTION, "energy", f"{SECTION}:energy", {"quick": quick}, 600.0))
-    alone = partial(ReportJob, SECTION, timeout=900.0, alone=True)
+    ]
+    made.append(ReportJob(energy, "energy", {"quick": quick}, 600.0))
+    alone = partial(ReportJob, timeout=900.0, alone=True)
     made += [
-        alone(
-            f"{family}: {name}", f"{SECTION}:system_points", {"name": name, "family": family, "quick": quick}
-        )
+        alone(system_points, f"{family}: {name}", {"name": name, "family": family, "quick": quick})
         for name in names
         for family in families
     ]
+    rounds = 1 if quick else 3
     made += [
-        alone(
-            f"first step: {name}",
-            f"{SECTION}:first_step_seconds",
-            {"name": name, "rounds": 1 if quick else 3},
-        )
-        for name in names
+        alone(first_step_seconds, f"first step: {name}", {"name": name, "rounds": rounds}) for name in names
     ]
     return made
 

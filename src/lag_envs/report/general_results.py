@@ -6,9 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.diagrams import labelled_lines
@@ -18,9 +19,6 @@ from lag_envs.report.points import LIBRARIES, MODES, TARGETS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.series import TOLERANCE
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Length of the control step [s], and the number of start states.
 DT, MEMBERS = 0.02, 200
@@ -365,8 +363,6 @@ STYLES = {
 
 def draw_times(name: str, rows: Sequence[Row]) -> Figure:
     """Draw worst errors against times; of each column, the settings that no other setting beats."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     for ax, (mode, words) in zip(figure.subplots(1, 2, sharey=True), MODES.items(), strict=True):
         ax.set_xscale("log")

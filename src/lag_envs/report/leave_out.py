@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from lag_envs import TASKS
 from lag_envs.envs.program import Program
@@ -23,10 +24,6 @@ from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.tasks.base import Task
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-SECTION = "leave_out"
 BATCH = 1024
 
 
@@ -79,14 +76,8 @@ def jobs(quick: bool) -> list[ReportJob]:
     """Return the jobs: one that examines the compiled code of every id, one that measures times."""
     count = QUICK_PAIRS if quick else len(PAIRS)
     return [
-        ReportJob(SECTION, "terms", f"{SECTION}:terms"),
-        ReportJob(
-            SECTION,
-            "savings",
-            f"{SECTION}:savings",
-            {"count": count, "rounds": 5 if quick else 15},
-            alone=True,
-        ),
+        ReportJob(terms, "terms"),
+        ReportJob(savings, "savings", {"count": count, "rounds": 5 if quick else 15}, alone=True),
     ]
 
 
@@ -284,8 +275,6 @@ def _claims(rows: list[Row], saved: list[Row]) -> list[Claim]:
 
 
 def _bars(rows: list[Row]) -> Figure:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(7.5, 0.6 + 0.34 * len(rows)), layout="constrained")
     axis = figure.subplots()
     place = np.arange(len(rows))[::-1]

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from lag_envs.report.diagrams import DARK, STYLES, labelled_lines
 from lag_envs.report.points import LAG_ENVS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: A scene with a dedicated step, a system for the general series, and the methods that step both.
 SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
@@ -31,8 +30,6 @@ def draw_overview(accuracy: dict[str, Any]) -> Figure:
     accuracy : dict
         The contents of ``docs/accuracy.json``.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     _panel(left, "A bar on a moving support: a dedicated step", *own_step(accuracy))

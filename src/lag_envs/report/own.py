@@ -34,7 +34,6 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.derivation import order_of
 
-SECTION = "own"
 #: Number of states with exact ends, and of states for the certificate; the same for a quick report.
 MEMBERS, MANY = 50, 1000
 FEW, SOME = 6, 100
@@ -170,15 +169,12 @@ def jobs(quick: bool, file: str) -> list[ReportJob]:
         "digest": hashlib.sha256(path.read_bytes() + motions.encode()).hexdigest()[:16],
         "quick": quick,
     }
-    kinds = {"steps": "shipped_steps", "stability": "stability", "points": "step_points"}
+    kinds = {"steps": shipped_steps, "stability": stability, "points": step_points}
     return [
-        ReportJob(
-            SECTION, f"{what}: {s.name}", f"{SECTION}:{function}", about | {"name": s.name}, 900.0,
-            alone=what == "points",
-        )
+        ReportJob(function, f"{what}: {s.name}", about | {"name": s.name}, 900.0, alone=what == "points")
         for what, function in kinds.items()
         for s in found
-    ]  # fmt: skip
+    ]
 
 
 def shipped_steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:

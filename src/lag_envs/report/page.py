@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lag_envs import store
@@ -59,8 +60,6 @@ def figure_file(picture: ReportFigure) -> str:
 
 def write_figure(picture: ReportFigure, folder: Path) -> Path:
     """Write a figure; the file depends only on the drawing."""
-    import matplotlib
-
     path = folder / figure_file(picture)
     with matplotlib.rc_context({"svg.hashsalt": "lag_envs", "svg.fonttype": "none", "font.size": 9}):
         picture.draw().savefig(

@@ -39,21 +39,25 @@ LIBRARIES = (
 class ReportJob:
     """A piece of work that takes seconds.
 
-    ``function``, as "module:name" within this package or "package.module:name", is called with the arguments
-    and yields rows of JSON types. If it raises an error, earlier rows are kept and the error is noted.
+    Its function, at the top of its section's module, is called with the arguments and yields rows of JSON
+    types. If it raises an error, earlier rows are kept and the error is noted.
     """
 
-    section: str
+    function: Callable[..., Iterator[Row]]
     name: str  #: describes the work; unique within the section
-    function: str
     arguments: dict[str, Any] = field(default_factory=dict)
     timeout: float = 120.0  #: seconds until the job counts as hanging
     alone: bool = False  #: whether it measures time, so that nothing else may run at the same time
 
     @property
+    def section(self) -> str:
+        """The name of the section, as `module` takes it."""
+        return self.function.__module__.removeprefix(f"{__package__}.")
+
+    @property
     def key(self) -> str:
         """The key under which rows are stored; it depends on arguments, code and machine."""
-        parts = [self.section, self.name, self.function, self.arguments, fingerprint()]
+        parts = [self.section, self.name, self.function.__name__, self.arguments, fingerprint()]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -165,12 +169,13 @@ def _begin(folder: str) -> None:
     reference.store.mkdir(exist_ok=True)
 
 
-def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | None, float]:
+def _work(
+    function: Callable[..., Iterator[Row]], arguments: dict[str, Any], rows: Path
+) -> tuple[str | None, float]:
     """Do a job, write its rows, and return its problem, if any, and its time in seconds."""
     start, problem = time.monotonic(), None
     try:
-        place, _, name = function.partition(":")
-        for row in getattr(module(place), name)(**arguments):
+        for row in function(**arguments):
             store.append(rows, row)
     except Exception as error:
         problem = error_line(error)
@@ -179,7 +184,7 @@ def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | N
 
 def module(name: str) -> Any:
     """Return a module of this package or, if the name has a dot, of another package."""
-    return import_module(name if "." in name else f"lag_envs.report.{name}")
+    return import_module(name if "." in name else f"{__package__}.{name}")
 
 
 def error_line(error: BaseException) -> str:

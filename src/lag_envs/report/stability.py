@@ -31,7 +31,6 @@ from lag_envs.scenes.derivation import motion_constants_of
 
 __all__ = ["content", "extreme_errors", "jobs", "largest_errors", "map_errors", "methods", "step_cases"]
 
-SECTION = "stability"
 #: Precisions of the comparison integrators, and the endings of their names.
 PRECISIONS: dict[str, type[np.floating]] = {"": np.float64, ", float32": np.float32}
 
@@ -47,14 +46,11 @@ def jobs(quick: bool) -> list[ReportJob]:
                 continue
             for dt in _decades(-6, 0, 5 if quick else 13):
                 arguments = {"map": title, "name": name, "dt": dt, "values": values}
-                found.append(
-                    ReportJob(SECTION, f"{name}, {title}, step {dt:.2g} s", "stability:map_errors", arguments)
-                )
+                found.append(ReportJob(map_errors, f"{name}, {title}, step {dt:.2g} s", arguments))
     cases = list(extremes.QUICK if quick else extremes.EXTREMES)
     parts = 2 if quick else 6
     return found + [
-        ReportJob(SECTION, f"extreme cases {i + 1}", "stability:extreme_errors", {"names": cases[i::parts]})
-        for i in range(parts)
+        ReportJob(extreme_errors, f"extreme cases {i + 1}", {"names": cases[i::parts]}) for i in range(parts)
     ]
 
 

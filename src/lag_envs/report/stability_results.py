@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from lag_envs.report import extremes
 from lag_envs.report.cases import MAIN, VARIANTS
@@ -16,9 +20,6 @@ from lag_envs.report.extremes import EXACT
 from lag_envs.report.points import LAG_ENVS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.report.stability_maps import MAPS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PEERS = ("ETD4RK", "implicit midpoint", "RK4", "Verlet", "explicit Euler")
 #: Contents of a cell other than an error.
@@ -251,9 +252,6 @@ def _edges(values: Sequence[float]) -> np.ndarray:
 
 def _paint(axes: Any, x: Any, y: Any, values: Sequence[Sequence[Any]]) -> Any:
     """Draw cells that hold errors or a special state; return the mappable for the colour bar."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
     shades = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.9, 190)))
     logs = [
         [math.log10(max(v, 1e-17)) if isinstance(v, float) else math.nan for v in line] for line in values
@@ -267,8 +265,6 @@ def _paint(axes: Any, x: Any, y: Any, values: Sequence[Sequence[Any]]) -> Any:
 
 
 def _finish(figure: Figure, mesh: Any, panels: Any) -> None:
-    from matplotlib.patches import Patch
-
     ticks = range(LOWEST + 1, HIGHEST + 1, 2)
     label = "log10 of the error relative to its scale"
     figure.colorbar(mesh, ax=panels, label=label, fraction=0.03, ticks=ticks)
@@ -277,8 +273,6 @@ def _finish(figure: Figure, mesh: Any, panels: Any) -> None:
 
 
 def _draw_map(rows: Sequence[Row], label: str, n: str) -> Figure:
-    from matplotlib.figure import Figure
-
     xs, ys = (sorted({row[key] for row in rows}) for key in ("x", "dt"))
     known = {(row["x"], row["dt"]): row["errors"] for row in rows}
     figure = Figure(figsize=(9, 7), layout="constrained")
@@ -305,8 +299,6 @@ def _draw_map(rows: Sequence[Row], label: str, n: str) -> Figure:
 
 
 def _draw_cases(rows: Sequence[Row]) -> Figure:
-    from matplotlib.figure import Figure
-
     order = list(extremes.EXTREMES)
     rows = sorted(rows, key=lambda row: -order.index(row["name"]))
     methods = [LAG_ENVS, f"{LAG_ENVS}, float32", *(name + n for n in ("", ", 16") for name in PEERS)]

@@ -32,7 +32,6 @@ from lag_envs.stepping.flows import Flow
 
 __all__ = ["content", "jobs", "orders", "state_errors", "variant_points"]
 
-SECTION = "work_precision"
 #: Orders of the series whose convergence is measured; those that are not shipped are used only for this.
 ORDERS = tuple(range(4, 21, 2))
 
@@ -77,16 +76,15 @@ def jobs(quick: bool) -> list[ReportJob]:
     horizons = QUICK if quick else HORIZONS
     made = [
         ReportJob(
-            SECTION,
+            references,
             f"references: {name}, {horizon}",
-            f"{SECTION}:references",
             {"variant": name, "horizon": horizon, "quick": quick},
             timeout=300.0,
         )
         for horizon in horizons
         for name in names
     ]
-    made.append(ReportJob(SECTION, "orders", f"{SECTION}:orders", {"variant": MAIN, "quick": quick}))
+    made.append(ReportJob(orders, "orders", {"variant": MAIN, "quick": quick}))
     for name in names:
         variant = VARIANTS[name]
         kinds = [
@@ -96,9 +94,8 @@ def jobs(quick: bool) -> list[ReportJob]:
         ]
         made += [
             ReportJob(
-                SECTION,
+                variant_points,
                 f"{family}: {name}",
-                f"{SECTION}:variant_points",
                 {"variant": name, "family": family, "quick": quick},
                 timeout=600.0,
                 alone=True,
