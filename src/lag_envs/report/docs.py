@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -210,50 +210,35 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     sections = {section["name"]: section for section in accuracy["sections"]}
     claims = [claim for section in accuracy["sections"] for claim in section["claims"]]
     broken = [claim for claim in claims if claim["holds"] is False]
-    lines = [
+    parts = [
         "# Accuracy",
-        "",
         "This page shows what was measured, how other methods compare, and where they are better. It is "
         "generated from the measurements of `lag-envs report`.",
-        "",
         "## Error against run time",
-        "",
         *_picture({"file": f"{OVERVIEW.name}.png", "caption": OVERVIEW.caption}),
-        "",
         "The main results:",
-        "",
-        *(f"- {text}" for text in (*FIRST, *overview.overview_sentences(accuracy))),
-        "",
-        *_command("work_precision,general"),
+        _bullets([*FIRST, *overview.overview_sentences(accuracy)]),
+        _command("work_precision,general"),
         "## What is promised",
-        "",
         INTRODUCTION,
     ]
     for part in PARTS:
         if part.section not in sections:
             continue
         section = sections[part.section]
-        lines += ["", f"## {part.title}", "", part.text]
+        parts += [f"## {part.title}", part.text]
         for picture in section["pictures"]:
             if picture["file"].startswith(part.pictures or ("-",)):
-                lines += ["", *_picture(picture)]
+                parts += _picture(picture)
         if section["summary"]:
-            lines += ["", _table(section["summary"])]
-        lines += ["", f"{_holding(section['claims'])}.", "", *_command(part.section)]
-        lines += [f"[Method, all tables and figures]({DETAILS}#{_anchor(section['title'])})"]
-    lines += [
-        "",
-        "## What does not hold",
-        "",
-        _holding(claims) + (". These do not:" if broken else "."),
-        *([""] if broken else []),
-        *(f"- {claim['text']} ({claim['evidence']})" for claim in broken),
-        "",
-        "## Machine and versions",
-        "",
-        *_about(accuracy),
-    ]
-    return "\n".join(lines) + "\n"
+            parts.append(_table(section["summary"]))
+        parts += [f"{_holding(section['claims'])}.", _command(part.section)]
+        parts.append(f"[Method, all tables and figures]({DETAILS}#{_anchor(section['title'])})")
+    parts += ["## What does not hold", _holding(claims) + (". These do not:" if broken else ".")]
+    if broken:
+        parts.append(_bullets(f"{claim['text']} ({claim['evidence']})" for claim in broken))
+    parts += ["## Machine and versions", *_about(accuracy)]
+    return "\n\n".join(parts) + "\n"
 
 
 INTRODUCTION = """\
@@ -280,30 +265,27 @@ FIRST = (
 
 def details(accuracy: dict[str, Any]) -> str:
     """Return docs/accuracy-details.md: every section with its texts, claims, tables and figures."""
-    lines = [
-        "# Accuracy: details",
-        "",
-        "This is the full report; read [Accuracy](accuracy.md) first.",
-        "",
-    ]
-    lines += _about(accuracy)
+    parts = ["# Accuracy: details", "This is the full report; read [Accuracy](accuracy.md) first."]
+    parts += _about(accuracy)
     for section in accuracy["sections"]:
-        lines += ["", f"## {section['title']}"]
-        for paragraph in section["text"]:
-            lines += ["", paragraph]
+        parts += [f"## {section['title']}", *section["text"]]
         if section["claims"]:
             rows = [
                 (claim["text"], f"**{page.VERDICTS[claim['holds']]}**", claim["evidence"])
                 for claim in section["claims"]
             ]
-            lines += ["", markdown_table(["claim", "verdict", "measured"], rows)]
+            parts.append(markdown_table(["claim", "verdict", "measured"], rows))
         for table in section["tables"]:
-            lines += ["", f"*{table['caption']}*", "", _table(table)]
+            parts += [f"*{table['caption']}*", _table(table)]
         for picture in section["pictures"]:
-            lines += ["", *_picture(picture)]
+            parts += _picture(picture)
         if section["problems"]:
-            lines += ["", "Did not work:", "", *(f"- {problem}" for problem in section["problems"])]
-    return "\n".join(lines) + "\n"
+            parts += ["Did not work:", _bullets(section["problems"])]
+    return "\n\n".join(parts) + "\n"
+
+
+def _bullets(texts: Iterable[str]) -> str:
+    return "\n".join(f"- {text}" for text in texts)
 
 
 def _holding(claims: Sequence[dict[str, Any]]) -> str:
@@ -312,11 +294,11 @@ def _holding(claims: Sequence[dict[str, Any]]) -> str:
 
 def _picture(picture: dict[str, str]) -> list[str]:
     alt = picture["caption"].partition(". ")[0]
-    return [f"![{alt}]({FIGURES}/{picture['file']})", "", f"*{picture['caption']}*"]
+    return [f"![{alt}]({FIGURES}/{picture['file']})", f"*{picture['caption']}*"]
 
 
-def _command(sections: str) -> list[str]:
-    return [f"Measure it: `lag-envs report --sections {sections}`.", ""]
+def _command(sections: str) -> str:
+    return f"Measure it: `lag-envs report --sections {sections}`."
 
 
 def _about(accuracy: dict[str, Any]) -> list[str]:
@@ -324,7 +306,6 @@ def _about(accuracy: dict[str, Any]) -> list[str]:
     return [
         f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']};"
         f" {accuracy['settings']['date']}; {page.cell_text(accuracy['job_seconds'])} s of work.",
-        "",
         ", ".join(f"{name} {number}" for name, number in accuracy["versions"].items()) + ".",
     ]
 

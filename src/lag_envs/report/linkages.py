@@ -99,10 +99,6 @@ class System:
         return states, controls
 
 
-def _scene(kind: type[Scene], **parameters: Any) -> Any:
-    return kind(**parameters)
-
-
 def _bars(
     lengths: Sequence[float], masses: Sequence[float], centres: Sequence[float], own: Sequence[float]
 ) -> list:
@@ -118,7 +114,7 @@ def _bars(
 
 
 def _cart_pole() -> System:
-    s = _scene(CartPole)
+    s = CartPole()
     own = s.pole_mass * s.half_length**2 / 3
     cart = Link("slide", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), s.cart_mass, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     pole = Link(
@@ -128,7 +124,7 @@ def _cart_pole() -> System:
 
 
 def _acrobot() -> System:
-    s = _scene(Acrobot)
+    s = Acrobot()
     links = _bars(
         (s.length_1, s.length_2), (s.mass_1, s.mass_2), (s.com_distance_1, s.com_distance_2),
         (s.inertia_1, s.inertia_2),
@@ -137,7 +133,7 @@ def _acrobot() -> System:
 
 
 def _rotary() -> System:
-    s, zero = _scene(RotaryPendulum), (0.0, 0.0, 0.0)
+    s, zero = RotaryPendulum(), (0.0, 0.0, 0.0)
     arm = Link("hinge", (0.0, 0.0, 1.0), zero, 1.0, zero, (1.0, 1.0, s.arm_inertia))
     rod = Link(
         "hinge", (1.0, 0.0, 0.0), (s.arm_length, 0.0, 0.0), s.mass, (0.0, 0.0, -s.com_distance),
@@ -147,7 +143,7 @@ def _rotary() -> System:
 
 
 def _chain(bars: int, name: str, speed: float) -> System:
-    s = _scene(Chain, bars=bars)
+    s = Chain(bars=bars)
     links = _bars(*([x] * bars for x in (s.length, s.mass, s.com_distance, s.inertia)))
     return System(name, s, (np.pi,) * bars, (speed,) * bars, 15.0, links, relative=True, field=True)
 

@@ -121,19 +121,22 @@ def rate_lines(equation: Equation) -> tuple[list[str], list]:
     return record_block(trace, {f"d{i}": value for i, value in enumerate(found)})
 
 
-@cache
-def _rate(equation: Equation) -> Callable:
-    """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
+def one_rate_lines(equation: Equation) -> list[str]:
+    """Return the lines that write the rate of a state y with parameters p at the time t into out."""
     lines, values = rate_lines(equation)
-    source = [
+    return [
         *(f"y{i} = y[{i}]" for i in range(equation.size)),
         *(f"p{i} = p[{i}]" for i in range(equation.parameters)),
         *lines,
-        f"out = np.empty({equation.size})",
         *(f"out[{i}] = {value}" for i, value in enumerate(values)),
-        "return out",
     ]
-    return compile_lines("rate", "t, y, p", source)
+
+
+@cache
+def _rate(equation: Equation) -> Callable:
+    """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
+    lines = [f"out = np.empty({equation.size})", *one_rate_lines(equation), "return out"]
+    return compile_lines("rate", "t, y, p", lines)
 
 
 @cache

@@ -9,7 +9,7 @@ import numpy as np
 
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import RADAU
-from lag_envs.report.peers import rate_lines
+from lag_envs.report.peers import one_rate_lines
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import Sample
 from lag_envs.stepping.compiling import compile_function, compile_lines
@@ -88,12 +88,5 @@ class CompiledRadau(Rival):
 @cache
 def _loop(equation: Equation) -> Callable:
     """Compile ``radau(starts, p, ends, a, n, h)``: n steps from each state, one after the other."""
-    lines, values = rate_lines(equation)
-    source = [
-        *(f"y{i} = y[{i}]" for i in range(equation.size)),
-        *(f"p{i} = p[{i}]" for i in range(equation.parameters)),
-        *lines,
-        *(f"out[{i}] = {value}" for i, value in enumerate(values)),
-    ]
-    rate = compile_lines("rate", "t, y, p, out", source)
+    rate = compile_lines("rate", "t, y, p, out", one_rate_lines(equation))
     return compile_function("radau", SOURCE.lstrip(), rate, LAST=LAST, MOST=MOST, APART=APART)
