@@ -1,5 +1,6 @@
 """Boards with fake submissions."""
 
+import hashlib
 import json
 
 import fake_submissions
@@ -29,6 +30,15 @@ def add(board, name="PPO", nonce=None, **told):
 
 def lines(board):
     return [json.loads(line) for line in board.log.read_bytes().splitlines()]
+
+
+def chained(*events):
+    """Return a log of events, each with the hash of the log before it."""
+    log = b""
+    for event in events:
+        event = event | {"prev": hashlib.sha256(log).hexdigest()}
+        log += json.dumps(event, ensure_ascii=False).encode() + b"\n"
+    return log
 
 
 def events(board):

@@ -34,6 +34,23 @@ def flow(scene_name, params, state, control, dt, dps=40):
     return reference.exact_flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
 
 
+def linear(gamma, delta, slope, x, v, dt):
+    """Return (x, v) after dt under x'' = -gamma x' + delta + slope t.
+
+    Written with phi_k(-z) = sum_j (-z)^j / (j + k)! = 1F1(1; k + 1; -z) / k!, which has no singular case at
+    z = gamma dt = 0.
+    """
+
+    def phi(k):
+        return mp.hyp1f1(1, k + 1, -gamma * dt) / mp.factorial(k)
+
+    lag = delta - gamma * v
+    return (
+        x + v * dt + lag * dt**2 * phi(2) + slope * dt**3 * phi(3),
+        v + lag * dt * phi(1) + slope * dt**2 * phi(2),
+    )
+
+
 def moving_plane(k, beta, gravity, radius, tilt_rate, state, dt):
     """Return (x, w, phi) after dt on a plane that turns at constant tilt_rate.
 

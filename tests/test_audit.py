@@ -11,7 +11,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
-from boards import lines
+from boards import chained, lines
 from covering import every, slow
 from fake_submissions import ENV, write
 
@@ -111,12 +111,8 @@ def refused(board):
 
 def relog(board, told, chain=True):
     """Write events as the log, with a new chain, as a careful forger would."""
-    content = b""
-    for event in told:
-        if chain:
-            event = event | {"prev": hashlib.sha256(content).hexdigest()}
-        content += json.dumps(event, ensure_ascii=False).encode() + b"\n"
-    board.log.write_bytes(content)
+    by_hand = (json.dumps(event, ensure_ascii=False).encode() + b"\n" for event in told)
+    board.log.write_bytes(chained(*told) if chain else b"".join(by_hand))
 
 
 def at(told, event, number=-1):
@@ -535,16 +531,16 @@ def test_the_repositorys_board_is_sound():
     found = checks.cheap(Board(ROOT / "leaderboard"))
     assert [text for finding in found.findings for text in finding.wrong] == []
     assert found.state.number in found.state.protocols
-    chained = [line.event.prev for line in found.lines]
-    assert all(chained[chained.index(next(filter(None, chained))) :])
+    links = [line.event.prev for line in found.lines]
+    assert all(links[links.index(next(filter(None, links))) :])
     nonces = audit._nonces(Board(ROOT / "leaderboard"), found)
     assert nonces.wrong == [] or nonces.open
 
 
 def test_a_log_without_a_chain_is_of_protocol_1_at_most():
     told = {"at": "2026-01-01T00:00:00.000000+00:00", "event": "nonce", "value": "n"}
-    chained = told | {"prev": hashlib.sha256(json.dumps(told).encode() + b"\n").hexdigest(), "value": "m"}
-    content = b"".join(json.dumps(e).encode() + b"\n" for e in (told, chained))
+    linked = told | {"prev": hashlib.sha256(json.dumps(told).encode() + b"\n").hexdigest(), "value": "m"}
+    content = b"".join(json.dumps(e).encode() + b"\n" for e in (told, linked))
     assert len(log.parse(content)[0]) == 2
     with pytest.raises(BoardError, match="line 3 holds no hash of the lines before it"):
         log.parse(content + json.dumps(told | {"value": "o"}).encode() + b"\n")

@@ -60,15 +60,6 @@ def call(capsys, *arguments):
 # --- the command ---
 
 
-@pytest.mark.parametrize("command", [[], *([command.name] for command in cli.COMMANDS)])
-def test_help_teaches(command, capsys):
-    status, out, _ = call(capsys, *command, "--help")
-    assert status == 0
-    assert "usage: lag-envs" in out
-    if command != ["list"]:
-        assert "examples:\n  lag-envs " in out
-
-
 def test_no_command_shows_the_help(capsys):
     status, out, err = call(capsys)
     assert (status, out) == (2, "")

@@ -1,6 +1,5 @@
 """The board's log survives kills, full disks, clones and several processes at once."""
 
-import hashlib
 import json
 import os
 import shutil
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
-from boards import add, events, fake_board, lines, states  # noqa: F401
+from boards import add, chained, events, fake_board, lines, states  # noqa: F401
 from covering import slow
 from fake_submissions import write
 
@@ -98,15 +97,6 @@ def test_a_damaged_line_is_named(board, line):
 def ids(board):
     told = (json.loads(line) for line in board.log.read_bytes().splitlines()[:-1])  # the last one is damaged
     return [line["id"] for line in told if "id" in line]
-
-
-def chained(*events):
-    """Return a log of events, each with the hash of the log before it."""
-    log = b""
-    for event in events:
-        event = event | {"prev": hashlib.sha256(log).hexdigest()}
-        log += json.dumps(event).encode() + b"\n"
-    return log
 
 
 def rewritten(board, change):

@@ -345,11 +345,6 @@ def test_too_few_policies(nets):
     refused(nets, "at least 5 policies")
 
 
-def test_one_policy_under_several_seeds(nets):
-    (nets / "policy_3.safetensors").write_bytes((nets / "policy_1.safetensors").read_bytes())
-    refused(nets, "seeds 1 and 3 are the same")
-
-
 def test_no_policy(folder):
     (folder / "policy_0.safetensors").unlink()
     refused(folder, "at least 1 policies")

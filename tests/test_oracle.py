@@ -6,14 +6,14 @@ import sympy
 from covering import every, slow
 from mpmath import mp, mpf
 from plain_target import FLOATS
-from reference import conditioning, flow, moving_plane, random_cases, scales
+from reference import conditioning, flow, linear, moving_plane, random_cases, scales
 from series_systems import SYSTEMS, acceleration
 
 from lag_envs import scenes
 from lag_envs.report import formulas, reference
 from lag_envs.report import oracle as oracles
 from lag_envs.report.bound import driven
-from lag_envs.report.closed_forms import elliptic, linear
+from lag_envs.report.closed_forms import elliptic
 from lag_envs.report.formulas import OperationList
 from lag_envs.report.oracle import Oracle, Unresolved, oracle_of
 from lag_envs.scenes import Scene, parameter

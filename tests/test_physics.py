@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import sympy
 from mpmath import mp, mpf
+from reference import linear
 from sympy import cos, sin
 
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import parameter_names
-from lag_envs.report.closed_forms import linear
 from lag_envs.scenes import Chain, CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.scenes.symbolic import symbolic, t

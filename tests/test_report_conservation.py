@@ -21,10 +21,6 @@ def claims(content):
 FORMS = [id for id in TASKS if form_of(TASKS[id]().scene) is not None]
 
 
-def task(id, **keywords):
-    return TASKS[id](**keywords)
-
-
 @pytest.fixture(scope="module")
 def runs():
     rows = []
@@ -90,7 +86,7 @@ def test_a_broken_balance_is_seen(runs):
 
 @pytest.mark.parametrize("id", covering(FORMS))
 def test_nothing_is_carried_for_nothing(id):
-    row = leave_out.carried_numbers(task(id))
+    row = leave_out.carried_numbers(TASKS[id]())
     assert (row["unused"], row["idle"]) == ([], [])
     assert row["operations"] > 0 and row["stages"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.benchmark import divisions, jacobians
@@ -70,28 +71,26 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     name = (row["library"], row["id"], row["kind"], f"{row['num_envs']:,}")
     if "steps_per_second" not in row:
         return (*name, row["problem"] or "not measured")
-    low, middle, high = row["steps_per_second"]
-    cells: tuple[str, ...] = (
-        *name,
-        rate_text(middle),
-        f"({rate_text(low)} - {rate_text(high)})",
-        f"{1e9 / middle:,.1f}",
-    )
+    rates = row["steps_per_second"]
+    cells: tuple[str, ...] = (*name, *_spread(rates, rate_text), f"{1e9 / rates[1]:,.1f}")
     if "ratio" in row:
-        low, middle, high = row["ratio"]
-        cells = (*cells, f"{middle:.2f}", f"({low:.2f} - {high:.2f})")
+        cells += _spread(row["ratio"], "{:.2f}".format)
     return (*cells, row["problem"]) if row["problem"] else cells
 
 
+def _spread(quartiles: Sequence[float], text: Callable[[float], str]) -> tuple[str, str]:
+    """Return the median and, in brackets, the other quartiles."""
+    low, middle, high = map(text, quartiles)
+    return middle, f"({low} - {high})"
+
+
 def _compared(row: dict[str, Any]) -> tuple[str, ...]:
-    low, middle, high = row["ratio"]
-    return row["id"], f"{row['num_envs']:,}", f"{middle:.2f}", f"({low:.2f} - {high:.2f})"
+    return row["id"], f"{row['num_envs']:,}", *_spread(row["ratio"], "{:.2f}".format)
 
 
 def _share(row: dict[str, Any]) -> tuple[str, ...]:
-    low, middle, high = row["share"]
     numbers = f"{row['num_envs']:,}", f"{row['products']:,}"
-    return row["id"], *numbers, f"{middle:.0%}", f"({low:.0%} - {high:.0%})"
+    return row["id"], *numbers, *_spread(row["share"], "{:.0%}".format)
 
 
 def _worst(target: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, model_validator
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Strict, ascii_text, checked
@@ -104,12 +104,9 @@ class VerificationResult(Strict):
         return self
 
 
-_RESULT: TypeAdapter[VerificationResult] = TypeAdapter(VerificationResult)
-
-
 def checked_result(result: Any) -> dict[str, Any]:
     """Return a valid result; raise a ValueError otherwise."""
-    checked(_RESULT, result)
+    checked(VerificationResult, result)
     return result
 
 
@@ -150,13 +147,10 @@ class ValueFunction(Strict):
         return self
 
 
-_VALUE: TypeAdapter[ValueFunction] = TypeAdapter(ValueFunction)
-
-
 def checked_value(content: bytes) -> dict[str, Any]:
     """Return the value function in a file; raise a ValueError if it is not one."""
     value = load_json(content)
-    checked(_VALUE, value)
+    checked(ValueFunction, value)
     return value
 
 

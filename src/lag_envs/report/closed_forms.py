@@ -1,7 +1,7 @@
-"""Closed forms of motions: elliptic functions for the undamped pendulum, and linear motion.
+"""The closed form of the undamped pendulum's motion, by elliptic functions.
 
-The closed forms check the oracle. They replace it if a pendulum turns so far that the oracle, which takes a
-step per radian, would need minutes.
+It checks the oracle, and replaces it if a pendulum turns so far that the oracle, which takes a step per
+radian, would need minutes.
 """
 
 from __future__ import annotations
@@ -14,23 +14,6 @@ from mpmath import mp, mpf
 
 from lag_envs.report.formulas import reduced
 from lag_envs.report.oracle import Oracle
-
-
-def linear(gamma: mpf, delta: mpf, slope: mpf, x: mpf, v: mpf, dt: mpf) -> tuple[mpf, mpf]:
-    """Return (x, v) after dt under x'' = -gamma x' + delta + slope t.
-
-    Written with phi_k(-z) = sum_j (-z)^j / (j + k)! = 1F1(1; k + 1; -z) / k!, which has no singular case at
-    z = gamma dt = 0.
-    """
-
-    def phi(k: int) -> mpf:
-        return mp.hyp1f1(1, k + 1, -gamma * dt) / mp.factorial(k)
-
-    lag = delta - gamma * v
-    return (
-        x + v * dt + lag * dt**2 * phi(2) + slope * dt**3 * phi(3),
-        v + lag * dt * phi(1) + slope * dt**2 * phi(2),
-    )
 
 
 def elliptic(alpha: mpf, beta: mpf, theta: mpf, rate: mpf, dt: mpf) -> tuple[mpf, mpf]:
