@@ -14,7 +14,7 @@ from rollouts import actions
 from lag_envs.report import environment_results, environments, episodes, gymnasium_peers
 from lag_envs.report.bound import Driven
 from lag_envs.report.cases import Case
-from lag_envs.report.episodes import RecordedEpisode, endless_actions, exact_states, record_episode
+from lag_envs.report.episodes import RecordedEpisode, endless_actions, exact_stepping, record_episode
 from lag_envs.report.integrators import comparison
 from lag_envs.report.oracle import Oracle, oracle_of
 from lag_envs.report.runner import JobResult
@@ -114,7 +114,7 @@ def test_exact_states_are_those_of_equations_that_are_typed_in():
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)
     episode = record_episode(env, endless_actions(env, 0))
-    path = exact_states(env.task, 0, episode.states[0], episode.controls, 34)
+    path = episodes.chained(exact_stepping(env.task, 0, 34), episode.states[0], episode.controls)
     names = "mass", "com_distance", "inertia", "damping", "gravity"
     m, arm, i, b, g = (Fraction(getattr(env.scene, name)) for name in names)
     about = m * arm**2 + i

@@ -196,8 +196,8 @@ def environment(id: str, n: int) -> Iterator[Row]:
     stepped = Stepped(scene, dt=dt)
     low, high = (float(u[0]) for u in task.control_range)
     reach = task.certified_speed()
-    assert reach is not None and stepped.angle is not None
-    angle, rng = stepped.angle, np.random.default_rng(1)
+    assert reach is not None and stepped.form.angle is not None
+    angle, rng = stepped.form.angle, np.random.default_rng(1)
 
     def state(theta: float, speed: float) -> list[float]:
         """Return a state with its other entries at the edge of the range of the task's starts."""

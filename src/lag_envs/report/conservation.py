@@ -123,8 +123,8 @@ def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArr
     largest = stepped.largest_majorant(problem.dt)
     if method != LAG_ENVS:
         stepped = Stepped(problem.scene, comparison(method, stepped.flow))
-    out = np.empty((len(at) + 1, stepped.width))
-    out[-1] = stepped.lift(np.array(problem.state))
+    out = np.empty((len(at) + 1, stepped.form.width))
+    out[-1] = stepped.form.lift(np.array(problem.state))
     filled = compile_march(stepped)(out, at, problem.dt, largest, *stepped.present())
     return out[:filled]
 
@@ -132,7 +132,7 @@ def lifted_run(problem: FreeMotion, method: str, at: NDArray[np.int64]) -> NDArr
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
     """Yield the drifts of a run without drag and drive; for lag_envs also error and amplified rounding."""
     problem = FREE[name]
-    scene, angle = problem.scene, Stepped(problem.scene).angle
+    scene, angle = problem.scene, Stepped(problem.scene).form.angle
     at = marks(steps)
     states = lifted_run(problem, method, at)
     at = at[: len(states)]

@@ -70,9 +70,7 @@ def labelled_lines(panels: Iterable[Axes]) -> dict[str, Any]:
 
 def panel(ax: Axes, points: Sequence[WorkPrecisionPoint], floor: float | None) -> None:
     """Draw all curves of one horizon and mode."""
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_ylim(LOWEST, 1.5)
+    ax.set(xscale="log", yscale="log", ylim=(LOWEST, 1.5))
     ax.grid(True, which="major", color="0.9", linewidth=0.6)
     ax.set_axisbelow(True)
     if floor:

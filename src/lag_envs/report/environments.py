@@ -21,9 +21,9 @@ from lag_envs.report.environment_results import COMPARED, LONG, RELEASED, conten
 from lag_envs.report.episodes import (
     DIGITS,
     RecordedEpisode,
+    chained,
     endless_actions,
     episode_errors,
-    exact_states,
     exact_stepping,
     moved_start,
     record_episode,
@@ -89,7 +89,7 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
     """Return the row of an episode of lag_envs; if requested, computed twice, with the difference."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
-        return exact_states(task, seed, start, episode.controls, digits)
+        return chained(exact_stepping(task, seed, digits), [mpf(x) for x in start], episode.controls)
 
     path, shifted = exact(episode.states[0]), exact(moved_start(episode.states), DIGITS - 10)
     entries = list(zip(task.scene.state_names, task.scene.state_units, strict=True))

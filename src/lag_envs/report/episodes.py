@@ -82,13 +82,6 @@ def exact_stepping(task: Task, seed: int, digits: int) -> ExactStep:
     return step
 
 
-def exact_states(
-    task: Task, seed: int, start: Sequence[Any], controls: Sequence[float], digits: int
-) -> list[list[mpf]]:
-    """Return the exact states of one of our episodes: the first one after a reset with that seed."""
-    return chained(exact_stepping(task, seed, digits), [mpf(x) for x in start], controls)
-
-
 def chained(step: ExactStep, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
     """Return the states from a start under controls, without rounding in between."""
     path = [list(start)]

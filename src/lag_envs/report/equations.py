@@ -124,25 +124,25 @@ class Problems:
 
     def __init__(self, cases: Sequence[Case]) -> None:
         self.cases = list(cases)
-        self._stepped = scene = Stepped(self.cases[0].scene)
+        stepped = Stepped(self.cases[0].scene)
+        self._form, flow = stepped.form, stepped.flow
         constants = [motion_constants_of(case.scene) for case in self.cases]
         self._k = SimpleNamespace(**{name: np.array([k[name] for k in constants]) for name in constants[0]})
-        self._u = np.array([case.control for case in self.cases])
+        self._u = [np.array([case.control for case in self.cases])]
         states = np.array([case.state for case in self.cases])
-        self._lifted = scene.lift(states)
-        flow = scene.flow
-        given = scene.coefficients_at(self._lifted, self._u, self._k, np)
-        coefficients = np.array([np.broadcast_to(x, self._u.shape) for x in given])
+        self._lifted = self._form.lift(states)
+        given = self._form.coefficients_at(self._lifted, self._u, self._k, np)
+        coefficients = np.array([np.broadcast_to(x, len(self.cases)) for x in given])
         present = tuple(bool(row.any()) for row in coefficients)
         #: The equation to solve.
         self.equation: Equation = NormalFormEquation(flow.coefficients, present)
         rows = [row for row, there in zip(coefficients, present, strict=True) if there]
         if EQUATIONS[flow.coefficients].turns:
-            assert scene.angle is not None
-            rows.append(states[:, scene.angle])
+            assert self._form.angle is not None
+            rows.append(states[:, self._form.angle])
         #: Parameters, shape (parameters, problems).
         self.p: Array = np.array(rows).reshape(len(rows), len(self.cases))
-        self._variables = scene.unpack(self._lifted, self._u, self._k)
+        self._variables = self._form.unpack(self._lifted, self._u, self._k)
         #: Starts, the unknowns first and then cosine and sine, shape (lifted, problems).
         self.y: Array = np.array(self._variables, dtype=np.float64)
 
@@ -152,5 +152,5 @@ class Problems:
     def states(self, y: Array, span: float) -> Array:
         """Return the scene's states, one per line, from unknowns after the control was held for some time."""
         moved = [*y[:2], *self._variables[2:]]
-        ends = self._stepped.pack(moved, self._lifted, self._u, span, self._k)
-        return np.stack(ends[: len(self._stepped.form.state_names)], axis=1)
+        ends = self._form.pack(moved, self._lifted, self._u, span, self._k)
+        return np.stack(ends[: len(self._form.state_names)], axis=1)

@@ -181,7 +181,7 @@ def substeps(case: Case, dt: float) -> int:
     """Return how many substeps the step takes; negative if it is refused."""
     scene, state, control = case
     stepped = Stepped(scene, dt=dt)
-    y = map(float, stepped.lift(np.asarray(state, dtype=np.float64)))
+    y = map(float, stepped.form.lift(np.asarray(state, dtype=np.float64)))
     advance = stepped.code().compile()
     *_, status = advance(*y, control, dt, stepped.largest_majorant(dt), *stepped.present())
     return int(status)

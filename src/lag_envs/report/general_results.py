@@ -365,12 +365,9 @@ def draw_times(name: str, rows: Sequence[Row]) -> Figure:
     """Draw worst errors against times; of each column, the settings that no other setting beats."""
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     for ax, (mode, words) in zip(figure.subplots(1, 2, sharey=True), MODES.items(), strict=True):
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        ax.set_ylim(1e-16, 1.0)
+        ax.set(xscale="log", yscale="log", ylim=(1e-16, 1.0), xlabel="time of a control step [ns]")
         ax.grid(True, which="major", color="0.9", linewidth=0.6)
         ax.set_title(f"{name}, {words}", fontsize=10)
-        ax.set_xlabel("time of a control step [ns]")
         for title, (colour, marker) in STYLES.items():
             some = [
                 (r["ns"], r["error"])

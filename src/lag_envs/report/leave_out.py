@@ -107,7 +107,7 @@ def carried_numbers(task: Task) -> Row:
     given = [*program.y, *program.g, *program.a, *constants]
     return {
         "scene": type(scene).__name__,
-        "state": list(scene.state_names) + (["cos", "sin"] if stepped.angle is not None else []),
+        "state": list(scene.state_names) + (["cos", "sin"] if stepped.form.angle is not None else []),
         "terms": [name for name, there in code.terms.items() if there],
         "left_out": [name for name, there in code.terms.items() if not there],
         "stages": stepped.flow.method,

@@ -191,18 +191,18 @@ def step_cases(
     dtype : type
         Precision of everything: constants, state, arithmetic.
     """
-    scene = Stepped(found[0].scene)
+    form = Stepped(found[0].scene).form
     constants = [motion_constants_of(case.scene) for case in found]
     k = SimpleNamespace(**{key: np.array([c[key] for c in constants], dtype) for key in constants[0]})
-    u = np.array([case.control for case in found], dtype)
+    u = [np.array([case.control for case in found], dtype)]
     h = (dt / counts).astype(dtype)
     y: Sequence[Any] = [np.array(column, dtype) for column in zip(*(c.state for c in found), strict=True)]
-    if scene.angle is not None:
-        y = [*y, np.cos(y[scene.angle]), np.sin(y[scene.angle])]
+    if form.angle is not None:
+        y = [*y, np.cos(y[form.angle]), np.sin(y[form.angle])]
     for i in range(int(counts.max())):
-        moved = fast(scene.unpack(y, u, k), scene.coefficients_at(y, u, k, np), h, np)
-        new = scene.pack(moved, y, u, h, k)
+        moved = fast(form.unpack(y, u, k), form.coefficients_at(y, u, k, np), h, np)
+        new = form.pack(moved, y, u, h, k)
         y = [np.where(i < counts, a, b) for a, b in zip(new, y, strict=True)]
         if any(a.dtype != dtype for a in y):
             raise TypeError(f"{[str(a.dtype) for a in y]} is not {dtype.__name__}")
-    return np.transpose(y[: len(scene.form.state_names)]).astype(float).tolist()
+    return np.transpose(y[: len(form.state_names)]).astype(float).tolist()

@@ -30,7 +30,8 @@ class Stepped:
     Examples
     --------
     >>> from lag_envs.scenes import PivotedBar
-    >>> [float(x) for x in Stepped(PivotedBar(track=None)).lift([0.0, 3.0])]
+    >>> variables, _ = Stepped(PivotedBar(track=None)).at([0.0, 3.0], 0.0)
+    >>> [float(x) for x in variables]
     [0.0, 3.0, 1.0, 0.0]
     """
 
@@ -40,28 +41,12 @@ class Stepped:
             raise ValueError(f"{type(scene).__name__} has no normal form")
         self.scene, self.form = scene, form
         self.flow: Flow = form.flow(dt) if flow is None else flow
-        self.angle, self.width = form.angle, form.width
-
-    def lift(self, state: ArrayLike) -> tuple:
-        """Return the lifted state."""
-        return self.form.lift(state)
-
-    def coefficients_at(self, y: Any, u: Any, k: Any, xp: Any) -> Any:
-        """Return the flow's coefficients."""
-        return self.form.coefficients_at(y, [u], k, xp)
-
-    def unpack(self, y: Any, u: Any, k: Any) -> list:
-        """Return the flow's variables."""
-        return self.form.unpack(y, [u], k)
-
-    def pack(self, moved: Any, y: Any, u: Any, dt: Any, k: Any) -> list:
-        """Return the lifted state at the end."""
-        return self.form.pack(moved, y, [u], dt, k)
 
     def at(self, state: ArrayLike, u: Any) -> tuple[list, Any]:
         """Return the flow's variables and coefficients at a state under a control."""
-        y, k = self.lift(np.asarray(state, np.float64)), SimpleNamespace(**motion_constants_of(self.scene))
-        return self.unpack(y, u, k), self.coefficients_at(y, u, k, np)
+        form, k = self.form, SimpleNamespace(**motion_constants_of(self.scene))
+        y = form.lift(np.asarray(state, np.float64))
+        return form.unpack(y, [u], k), form.coefficients_at(y, [u], k, np)
 
     def largest_majorant(self, dt: float) -> float:
         """Return the x of the bound up to which one series is certified."""

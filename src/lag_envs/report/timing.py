@@ -141,13 +141,13 @@ class FlowSteps:
 
     def fill(self, cases: Sequence[Case]) -> Array:
         """Return the rows of a batch."""
-        y = self.stepped.lift(np.array([case.state for case in cases]))
+        y = self.stepped.form.lift(np.array([case.state for case in cases]))
         columns = np.array([*y, [case.control for case in cases], np.ones(len(cases))])
         return blocks(columns, BLOCK).ravel()
 
     def states(self, rows: Array, count: int) -> Array:
         """Return the states of a batch, one per line."""
-        columns = unblocked(rows.reshape(-1, self.stepped.width + 2, BLOCK), count)
+        columns = unblocked(rows.reshape(-1, self.stepped.form.width + 2, BLOCK), count)
         return columns[: len(self.stepped.form.state_names)].T
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 from lag_envs.report.cases import VARIANTS
@@ -74,20 +75,16 @@ class Duel(NamedTuple):
 def compared(points: Sequence[WorkPrecisionPoint], floor: dict[tuple, float]) -> list[Duel]:
     """Return all comparisons, with errors up to `ROUNDINGS` amplified roundings counting as none."""
     found = []
-    for variant in VARIANTS:
-        for horizon in HORIZONS:
-            for mode in MODES:
-                here = [p for p in points if (p.variant, p.horizon, p.mode) == (variant, horizon, mode)]
-                least = ROUNDINGS * floor.get((variant, horizon), ROUNDING)
-                for target in TARGETS if here else ():
-                    reached = [p for p in here if p.worst <= max(target, least)]
-                    found.append(
-                        Duel(
-                            variant, horizon, mode, target,
-                            min((p for p in reached if p.own), key=lambda p: p.ns, default=None),
-                            min((p for p in reached if not p.own), key=lambda p: p.ns, default=None),
-                        )
-                    )  # fmt: skip
+    for place in product(VARIANTS, HORIZONS, MODES):
+        here = [p for p in points if (p.variant, p.horizon, p.mode) == place]
+        least = ROUNDINGS * floor.get(place[:2], ROUNDING)
+        for target in TARGETS if here else ():
+            reached = [p for p in here if p.worst <= max(target, least)]
+            own, rival = (
+                min((p for p in reached if p.own is own), key=lambda p: p.ns, default=None)
+                for own in (True, False)
+            )
+            found.append(Duel(*place, target, own, rival))
     return found
 
 
@@ -226,16 +223,15 @@ def _rivals(points: Sequence[WorkPrecisionPoint]) -> Table:
     """Return every rival's shortest time to each error, for one step."""
     rows = []
     here = [p for p in points if p.horizon == "one step" and not p.own]
-    for variant in VARIANTS:
-        for mode, words in MODES.items():
-            group = [p for p in here if (p.variant, p.mode) == (variant, mode)]
-            shipped = _default(points, variant, mode)
-            for name in dict.fromkeys(p.name for p in group) if shipped else ():
-                some = [p for p in group if p.name == name]
-                best = [min((p.ns for p in some if p.worst <= t), default=None) for t in TARGETS]
-                if shipped and any(best):
-                    ratios = [ns and ns / shipped.ns for ns in best]
-                    rows.append([variant, words, name, *ratios, min(p.worst for p in some)])
+    for variant, mode in product(VARIANTS, MODES):
+        group = [p for p in here if (p.variant, p.mode) == (variant, mode)]
+        shipped = _default(points, variant, mode)
+        for name in dict.fromkeys(p.name for p in group) if shipped else ():
+            some = [p for p in group if p.name == name]
+            best = [min((p.ns for p in some if p.worst <= t), default=None) for t in TARGETS]
+            if shipped and any(best):
+                ratios = [ns and ns / shipped.ns for ns in best]
+                rows.append([variant, MODES[mode], name, *ratios, min(p.worst for p in some)])
     return Table(
         "work_precision_rivals",
         "Each rival's shortest time to an error in one control step, as a multiple of the time of lag_envs, "
@@ -252,16 +248,12 @@ def _default(points: Sequence[WorkPrecisionPoint], variant: str, mode: str) -> W
 
 def _summary(points: Sequence[WorkPrecisionPoint], found: Sequence[Duel]) -> Table:
     rows = []
-    for name in VARIANTS:
-        for mode, words in MODES.items():
-            shipped = _default(points, name, mode)
-            if shipped is None:
-                continue
-            here = {d.target: d for d in found if (d.variant, d.horizon, d.mode) == (name, "one step", mode)}
-            rows.append([
-                name, words, f"{shipped.worst:.0e}", round(shipped.ns, 1), *(_rival(here[t]) for t in SHOWN),
-            ])  # fmt: skip
     steps = [d for d in found if d.horizon == "one step"]
+    for name, mode in product(VARIANTS, MODES):
+        if shipped := _default(points, name, mode):
+            here = {d.target: d for d in steps if (d.variant, d.mode) == (name, mode)}
+            numbers = f"{shipped.worst:.0e}", round(shipped.ns, 1)
+            rows.append([name, MODES[mode], *numbers, *(_rival(here[t]) for t in SHOWN)])
     sentences = [f"To {t:.0e}: {_finding([d for d in steps if d.target == t])}." for t in SHOWN if steps]
     return Table(
         "work_precision",
