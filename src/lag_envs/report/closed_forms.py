@@ -7,6 +7,7 @@ radian, would need minutes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import sympy
@@ -55,13 +56,14 @@ def elliptic(alpha: mpf, beta: mpf, theta: mpf, rate: mpf, dt: mpf) -> tuple[mpf
     return 2 * (half + turns * mp.pi) - offset, rate
 
 
-def pendulum(oracle: Oracle, controls: Sequence[Any]) -> tuple[sympy.Rational, sympy.Rational] | None:
+@lru_cache(maxsize=256)
+def pendulum(oracle: Oracle, controls: tuple[float, ...]) -> tuple[sympy.Rational, sympy.Rational] | None:
     """Return (alpha, beta) if the only free coordinate moves as in `elliptic`, else None."""
     names, equations = oracle.names, oracle.equations
     if len(names.free) != 1 or any(kind == "momentum" for _, kind in names.state):
         return None
     q = equations.q[names.free[0]]
-    given = dict(zip(equations.u.values(), map(sympy.Rational, map(float, controls)), strict=True))
+    given = dict(zip(equations.u.values(), map(sympy.Rational, controls), strict=True))
     mass, force = (
         reduced(oracle.exactly(e).xreplace(given)) for e in (equations.mass[0], equations.force[0])
     )

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +25,10 @@ store: Path | None = None
 FAR = 5.0
 
 
-@lru_cache(maxsize=256)
-def _pendulum(oracle: Oracle, controls: tuple[float, ...]) -> tuple[Any, Any] | None:
-    return closed_forms.pendulum(oracle, controls)
-
-
 def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: int) -> list[mpf]:
     """Return the state after a time dt, from one computation with this many digits."""
     held = control_list(controls)
-    if known := _pendulum(oracle, tuple(map(float, held))):
+    if known := closed_forms.pendulum(oracle, tuple(map(float, held))):
         (_, speed), (alpha, beta) = oracle.start(state, held, float), known
         if float(dt) * (abs(speed[oracle.names.free[0]]) + math.hypot(alpha, beta) ** 0.5) > FAR:
             return closed_forms.closed_form_flow(oracle, known, state, held, dt, digits)

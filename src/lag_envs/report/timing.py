@@ -67,16 +67,11 @@ class FlowSteps:
             raise ValueError(f"compiled for the constants {self._names}, got {present}")
         return (dt, self.stepped.largest_majorant(dt), *(float(constants[name]) for name in present))
 
-    @property
-    def simulate(self) -> Callable:
-        """``simulate(trajectory, controls, dt, x, constants...)``, as called by `Scene.simulate`."""
-        return self._code.simulation
-
     def end(self, case: Case, dt: float, steps: int) -> Array:
         """Return the state after some steps with the control held; NaN if a step was refused."""
         trajectory = np.empty((steps + 1, len(case.state)))
         trajectory[0] = case.state
-        refused = self.simulate(
+        refused = self._code.simulation(
             trajectory, np.full((steps, 1), case.control), *self.arguments(case.scene, dt)
         )
         return np.full(len(case.state), np.nan) if refused else trajectory[-1]
@@ -91,7 +86,7 @@ class FlowSteps:
             f"    refused += simulate(trajectories[j], controls[j], dt, x{extra})",
             "return refused",
         ]
-        return compile_lines("several", f"trajectories, controls, dt, x{extra}", lines, self.simulate)
+        return compile_lines("several", f"trajectories, controls, dt, x{extra}", lines, self._code.simulation)
 
     @cached_property
     def batch(self) -> Callable:
