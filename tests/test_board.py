@@ -142,13 +142,9 @@ def test_changed_files_are_not_what_was_added(board):
     assert board.read().entry(id).reason == "its files are not those that were added"
 
 
-def test_changed_results_are_noticed(board):
+def test_a_missing_result_is_noticed(board):
     id = add(board, nonce="n")
-    path = board.folder / "results" / f"{id}.json.gz"
-    path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(BoardError, match="is not the file that was verified"):
-        board_data(board)
-    path.unlink()
+    (board.folder / "results" / f"{id}.json.gz").unlink()
     with pytest.raises(BoardError, match="is missing; restore it"):
         board_data(board)
 
