@@ -34,24 +34,27 @@ BESIDE = {
 @pytest.mark.slow
 @pytest.mark.parametrize("id", ["PivotedBar-v0", incline.Brake.id, chain.SwingUpTriple.id, *BESIDE])
 def test_a_frame_takes_eight_milliseconds_at_most(drive, id, tmp_path):
-    """In at least one of three drives, for the machine may be busy."""
+    """In at least one of three drives, as the machine may be busy; that lengthens painting most of all."""
     data = board_pages.data((id,), board_pages.AGENTS[:1])
     if id in BESIDE:
         data["environments"][0]["rows"][0]["agent"] = agent(made(id, *BESIDE[id]))
     write_page(data, tmp_path)
     drives = (frames(drive(id, folder=tmp_path), id in BESIDE) for _ in range(3))
-    assert any(np.quantile(found, 0.99) <= 8.0 for found in drives)
+    assert any(np.quantile(scripts, 0.99) <= 8.0 and np.median(whole) <= 8.0 for scripts, whole in drives)
 
 
 @pytest.mark.slow
 def test_so_does_the_frame_in_which_an_episode_ends(drive, tmp_path):
     write_page(board_pages.data(("PivotedBar-v0",), board_pages.AGENTS[:1]), tmp_path)
     drives = (frames(drive("PivotedBar-v0", folder=tmp_path), to_the_end=True) for _ in range(3))
-    assert any(max(found) <= 8.0 for found in drives)
+    assert any(max(scripts) <= 8.0 for scripts, _ in drives)
 
 
 def frames(page, ghost=False, to_the_end=False):
-    """Return the time of each frame while keys are pressed, with the processor throttled four times [ms]."""
+    """Return the main thread's time of each frame while keys are pressed, throttled four times [ms].
+
+    First of scripts alone, then of all work: scripts, layout and painting.
+    """
     if ghost:
         page.select_option(".drive-controls select >> nth=1", "live:0")
     cdp = page.context.new_cdp_session(page)
@@ -59,7 +62,7 @@ def frames(page, ghost=False, to_the_end=False):
     page.focus(".stage")
     page.keyboard.press("Space")
     page.wait_for_timeout(2000 if to_the_end else 500)  # the first frames also compile
-    page.context.browser.start_tracing(page=page, categories=["devtools.timeline"])
+    page.context.browser.start_tracing(page=page, categories=["devtools.timeline", "toplevel"])
     for i in range(8):
         if page.text_content(".go") == "Start again" and not to_the_end:
             page.keyboard.press("r")  # short episodes have too few frames
@@ -73,8 +76,17 @@ def frames(page, ghost=False, to_the_end=False):
     events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
     # Numbers that change are painted on a canvas, not laid out as text; a restart lays out some.
     layouts = sum(e["name"] == "Layout" for e in events)
-    # The main thread's own time: the machine may be busy otherwise.
-    took = np.array([e["tdur"] / 1e3 for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e])
-    print(len(took), np.quantile(took, [0.5, 0.95, 1.0]), layouts, "layouts")
-    assert len(took) > 30 and layouts < 0.1 * len(took)
-    return took
+    called = [e for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e]
+    tasks = [e for e in events if e["name"] == "ThreadControllerImpl::RunTask" and "tdur" in e]
+
+    def holds(task, call):
+        within = 0 <= call["ts"] - task["ts"] < task["dur"]
+        return within and (task["pid"], task["tid"]) == (call["pid"], call["tid"])
+
+    scripts = np.array([call["tdur"] / 1e3 for call in called])
+    whole = np.array([t["tdur"] / 1e3 for t in tasks if any(holds(t, call) for call in called)])
+    for name, took in (("scripts", scripts), ("whole frames", whole)):
+        median, most, longest = np.quantile(took, [0.5, 0.99, 1.0])
+        print(f"{len(took)} {name} [ms]: median {median:.2f}, 99 % {most:.2f}, longest {longest:.2f}")
+    assert len(whole) > 30 and layouts < 0.1 * len(whole)
+    return scripts, whole
