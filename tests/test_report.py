@@ -266,6 +266,8 @@ def test_without_a_report_or_its_compact_form(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert docs.main([]) == 2
     assert "docs/accuracy.json is not there; name a report's folder" in capsys.readouterr().err
+    assert docs.main(["elsewhere"]) == 2
+    assert "elsewhere holds no report.json; name a folder" in capsys.readouterr().err
 
 
 def test_broken_off_report_is_not_taken_over(written, tmp_path, capsys):

@@ -130,6 +130,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 2
         update(args.project)
         return 0
+    if not (args.report / FILE).is_file():
+        print(f"{args.report} holds no {FILE}; name a folder that `lag-envs report` wrote", file=sys.stderr)
+        return 2
     found = json.loads((args.report / FILE).read_text(encoding="utf-8"))
     if not found["complete"]:
         print(f"{args.report} is not complete; `lag-envs report {args.report}` resumes it", file=sys.stderr)

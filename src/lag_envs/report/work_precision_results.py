@@ -118,10 +118,10 @@ def _text(rows: Sequence[Row]) -> list[str]:
         f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and "
         "over the entries of the state. Each error is relative to the size of its entry, as "
         "docs/numerics.md defines accuracy; over 10 s and 1,000 s it is relative to the size at the end. "
-        "The reference is exact to 30 digits: a closed form if there is one (linear scenes; Jacobi's "
-        "elliptic functions for a pendulum without damping and drive), otherwise Taylor series in "
-        "fixed-point arithmetic. The control is held over the whole time. Over 1,000 s there is no "
-        "control, and pendulums have no damping.",
+        "The reference is exact to 30 digits: Lagrange's equations by SymPy, Taylor series in "
+        "python-flint's balls, and for undamped pendulums that move far Jacobi's elliptic functions. The "
+        "control is held over the whole time. Over 1,000 s there is no control, and pendulums have no "
+        "damping.",
         "lag_envs is timed as shipped: each scene's own order and tolerance, control step by control step. "
         "Over 10 s and 1,000 s there are also steps of half to eight times that length, and a single step "
         "that `simulate` divides ('lag_envs, one call'). The time includes testing whether a step is "
