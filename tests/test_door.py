@@ -15,7 +15,7 @@ import pytest
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes import CylinderInCylinder, door
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Circle
+from lag_envs.scenes.shapes import Circle, Line
 
 
 class Good(Scene):
@@ -327,6 +327,18 @@ INVALID = {
         {"bodies": lambda self: {"ground": Circle((0.0, 0.0), 1.0)}},
         "bodies; a list of shapes; 'ground'",
     ),
+    "shape in a colour": (
+        {"bodies": lambda self: {"ground": [Circle((0.0, 0.0), 1.0, "red")]}},
+        "bodies: a role must be one of body, mark; 'red'",
+    ),
+    "shape without pairs": (
+        {"bodies": lambda self: {"ground": [Line((0.0, 0.0, 1.0, 1.0))]}},
+        "bodies: points must be pairs (x, y)",
+    ),
+    "shape of texts": (
+        {"bodies": lambda self: {"ground": [Circle((0.0, 0.0), "1.0")]}},
+        "bodies: sizes must be numbers; '1.0'",
+    ),
     "indicator without a place": (
         {"indicators": lambda self, now, xp: {"arrow": now.q.x}},
         "indicators; 'arrow'; (x, y, angle, part)",
@@ -349,6 +361,16 @@ INVALID = {
 @mistake("kinetic", "kinetic(self, q, v, xp)", "method")
 def formula_that_is_no_method():
     return changed(kinetic=1.0)
+
+
+@mistake("Bad.rests must be a method, rests(self), got {'x': 0.1}")
+def rests_that_are_no_method():
+    return changed(rests={"x": 0.1})
+
+
+@mistake("Bad.window must be a method, window(self), got (0, 0, 1, 1)")
+def window_that_is_no_method():
+    return changed(window=(0, 0, 1, 1))
 
 
 # --- names -------------------------------------------------------------------------------------------------

@@ -238,12 +238,9 @@ def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
 
 def check_signature(scene: Any, name: str) -> None:
     """Raise a FormulaError if a formula does not take the expected arguments."""
-    method, arguments = getattr(scene, name, None), ARGUMENTS[name]
+    arguments, kinds = ARGUMENTS[name], inspect.Parameter
     wanted = f"{name}(self, {', '.join(arguments)})"
-    if not callable(method):
-        raise FormulaError(f"it must be a method, {wanted}, got {method!r:.60}")
-    kinds = inspect.Parameter
-    taken = list(inspect.signature(method).parameters.values())
+    taken = list(inspect.signature(getattr(scene, name)).parameters.values())
     if any(p.kind is kinds.VAR_POSITIONAL for p in taken):
         return
     plain = [p for p in taken if p.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)]

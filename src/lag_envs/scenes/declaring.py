@@ -17,12 +17,13 @@ from lag_envs.mechanics.layout import check_name, units
 #: Class attributes that are mappings, and those that are names in order.
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
 SEQUENCES = ("state", "left_out")
+METHODS = ("rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
 
 #: Where a task stores the order of the series that it chose for its scene.
 ORDER = "_order_of_task"
 
 #: What a scene may define; all other public names of `Scene` are its calls.
-DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
+DEFINED = (*MAPPINGS, *SEQUENCES, *METHODS)
 
 
 # If a class is sent to another process by value before its first use, its fields are sent too, and this
@@ -99,6 +100,11 @@ def declare_scene(cls: Any, meta: type[type]) -> None:
     for name in [n for n, v in own.items() if isinstance(v, dataclasses.Field) and n not in annotations]:
         faults.append(f"{name} has no annotation; write {name}: float = parameter(...)")
         delattr(cls, name)
+    base: Any = next(c for c in cls.__mro__ if isinstance(c, meta) and c.__base__ is object)
+    for name in [n for n in METHODS if n in own and n not in annotations]:
+        if not callable(own[name]) and not hasattr(own[name], "__get__"):
+            wanted = ", ".join(inspect.signature(getattr(base, name)).parameters)
+            faults.append(f"{name} must be a method, {name}({wanted}), got {own[name]!r:.60}")
     inherited = {name for parent in cls.__mro__[1:] for name in getattr(parent, "__dataclass_fields__", ())}
     for name in sorted(inherited.intersection(own) - {*annotations, "control"}):
         if not inspect.ismemberdescriptor(own[name]):  # a slot; of anything else a dataclass takes no notice

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import Expr, FormulaError
 from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.mechanics.recording import Values, formula
+from lag_envs.scenes.checks import real_array
 from lag_envs.scenes.derivation import layout_of
-from lag_envs.scenes.shapes import Frame, Pose, Shape, Window, extent, placed
+from lag_envs.scenes.shapes import Frame, Polygon, Pose, Role, Shape, Window, extent, placed
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
@@ -186,8 +187,23 @@ def check_shapes(of: Any, frame: str, shapes: Any) -> None:
                 f"{type(of).__name__}.bodies must have a list of shapes ({kinds}) for {frame!r}, "
                 f"got {shapes!r:.60}"
             )
-        if not math.isfinite(extent([shape])):
-            raise FormulaError(f"{type(of).__name__}.bodies: numbers must be finite, got {shape!r:.80}")
+        if fault := _fault(shape):
+            raise FormulaError(f"{type(of).__name__}.bodies: {fault}, got {shape!r:.80}")
+
+
+def _fault(shape: Any) -> str:
+    """Return what is wrong with a shape, if anything."""
+    roles = get_args(Role)
+    if getattr(shape, "role", roles[0]) not in roles:
+        return f"a role must be one of {', '.join(roles)}"
+    try:
+        sizes = real_array("", [getattr(shape, name, 1.0) for name in ("radius", "step", "size")])
+        points = real_array("", getattr(shape, "points", [getattr(shape, "centre", (0.0, 0.0))]))
+    except ValueError:  # no numbers, or pairs beside triples
+        return "sizes must be numbers, and points pairs (x, y)"
+    if points.shape[1:] != (2,) or len(points) < (3 if isinstance(shape, Polygon) else 1) or sizes.ndim > 1:
+        return "points must be pairs (x, y), three or more for a polygon"
+    return "" if np.isfinite(points).all() and np.isfinite(sizes).all() else "numbers must be finite"
 
 
 def indicated(of: Any, now: Now, xp: Any = Seen) -> dict[str, tuple]:

@@ -212,7 +212,7 @@ def extent(shapes: Sequence[Shape]) -> float:
             sizes.append(math.hypot(*shape.centre) + shape.radius)
         elif not isinstance(shape, Ruler):
             sizes += [math.hypot(*point) for point in shape.points]
-    return math.nan if any(map(math.isnan, sizes)) else max(sizes)
+    return max(sizes)
 
 
 def roller(radius: float, ratio: float) -> list[Shape]:
