@@ -743,6 +743,8 @@ def test_unknown_parameter():
         TypeError, match="unexpected keyword argument 'qqq'; available: mass, spring, friction"
     ):
         Good(qqq=1.0)
+    with pytest.raises(TypeError, match="3 were given; give mass, spring, friction, links by name"):
+        Good(1.0, 2.0)
 
 
 @pytest.mark.parametrize(

@@ -486,7 +486,7 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
         ([(STATES, None, np.arange(20))], {}, "finer even grid, with NaN between"),
         ([(STATES, np.full(19, np.nan), DT)], {}, "controls must be finite, got nan in row 0"),
         ([(STATES, np.zeros(18), DT)], {}, "20 states need controls for the 19 steps .* got 18"),
-        ([(STATES, np.zeros((19, 2)), DT)], {}, "controls must have shape"),
+        ([(STATES, np.zeros((19, 2)), DT)], {}, "controls must have shape .* for each step"),
         ([(STATES[:2], None, DT)], {}, "4 measured values are too few for 2 parameters and the 2 entries"),
         ([(STATES, None, DT)], {"free": []}, "free must name at least one"),
         ([(STATES, None, DT)], {"free": "mass"}, "free: parameters must be a sequence"),

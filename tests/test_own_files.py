@@ -315,6 +315,7 @@ def test_play_steps_and_starts_over(name, monkeypatch, capsys):
     assert "r: start over" in out
     if name.endswith("Drift"):
         assert "time is up: return" in out
+        assert "the scene has no bodies" in out
 
 
 # --- report ---

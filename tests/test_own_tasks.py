@@ -23,7 +23,7 @@ import lag_envs
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.scenes import CartPole, Scene, StepRefused, parameter
+from lag_envs.scenes import CartPole, Incline, Scene, StepRefused, parameter
 from lag_envs.tasks import Task, pivoted_bar
 from lag_envs.tasks.imperfections import KEYWORDS
 
@@ -356,6 +356,10 @@ def _guarded(function, x):
     [
         ({"scene": None}, "Mistaken.scene must be a class derived from Scene"),
         ({"action": {"shove": 1.0}}, r"action\['shove'\]: the scene has no such control, only push, pull"),
+        (
+            {"scene": Incline, "defaults": {}, "action": {"phi_dot": 1.0}},
+            r"action\['phi_dot'\]: the scene .* only drag; write 'control': 'tilt_rate' into defaults",
+        ),
         ({"action": {}}, "Mistaken.action must give limits"),
         ({"action": {"push": 0.0, "pull": 1.0}}, "limit above 0"),
         (
@@ -397,6 +401,7 @@ def _guarded(function, x):
         ),
         ({"reward": 0.0}, r"Mistaken.reward must be reward\(self, before, .*, got 0.0"),
         ({"reward": lambda self, b, after, *a: a[-1].clip(after.x, 0, 1)}, "it uses xp.clip, .* minimum"),
+        ({"reward": lambda self, b, after, *a: a[-1].pow(after.x, 2)}, r"it uses xp.pow, .* write x"),
         ({"reward": lambda self, b, after, *_: math.exp(after.x)}, "write xp.exp for math.exp"),
         ({"reward": lambda self, b, after, *_: np.exp(after.x)}, "write xp.exp"),
         ({"reward": lambda self, *_: self.scene.load_mas}, "no attribute 'load_mas'; did you mean load_mass"),
@@ -435,6 +440,7 @@ def _guarded(function, x):
         ({"bounds": lambda self: {"x": np.ones(2)}}, r"bounds\['x'\] must be .* got array"),
         ({"bounds": lambda self: None}, "^Mistaken.bounds returns None; it must return bounds by name"),
         ({"bounds": lambda self: [1.0, 2.0]}, "bounds returns a list; it must return bounds by name"),
+        ({"start": {"x": [0.0, 0.5]}}, r"start\['x'\] must be a half width or \(centre, .* got \[0.0, 0.5\]"),
         ({"start": {"x": (0.0, -0.5)}}, r"start\['x'\]: a half width must not be negative"),
         ({"target": {"x_goal": ("m", -1.0)}}, r"target\['x_goal'\]: a half width must not be negative"),
         ({"defaults": {"load_mas": 1.0}}, "Mistaken.defaults: .*'load_mas'; did you mean load_mass?"),
@@ -736,6 +742,8 @@ def test_misspelt_names_are_noticed():
         _mistaken(terminate=lambda self, after, target, xp: after.x > 1.0)()
     with pytest.warns(UserWarning, match=r"nothing uses Mistaken.slew; write imperfections = {'slew': ...}"):
         _mistaken(slew=3.0)()
+    with pytest.warns(UserWarning, match="Mistaken.load_mass does not change .* {'load_mass'"):
+        _mistaken(load_mass=3.0)()
     with pytest.warns(UserWarning, match=r"nothing uses Sticky.disipation; did you mean dissipation?"):
         type("Sticky", (own_tasks.Crane,), {"disipation": lambda self, q, v, u, xp: v.x**2})()
     # A name that a formula uses is the user's own business.

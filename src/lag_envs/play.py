@@ -120,6 +120,7 @@ def help_of(task: Any, space: gym.Space) -> list[str]:
     ways = zip(names, keys_by_number(space), STICKS, strict=False)
     lines = [f"{name}: {_keys(down, up)}, or the {stick}" for name, (down, up), stick in ways]
     return [
+        *([] if any(task.bodies().values()) else ["the scene has no bodies, so the window stays empty"]),
         *(lines or ["there is nothing to control: just watch"]),
         "r: start over",
         "q, or close the window: end",

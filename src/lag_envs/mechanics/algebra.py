@@ -36,11 +36,14 @@ INSTEAD = {
     "cosh": "(xp.exp(x) + xp.exp(-x)) / 2",
     "hypot": "xp.sqrt(x * x + y * y)",
     "log10": "xp.log(x) / xp.log(10)",
+    "max": "xp.maximum(x, y)",
+    "min": "xp.minimum(x, y)",
+    "power": "x**2, or xp.exp(p * xp.log(x)) where x is positive",
     "sign": "xp.where(x < 0, -1.0, 1.0)",
     "sinh": "(xp.exp(x) - xp.exp(-x)) / 2",
     "square": "x * x",
 }
-INSTEAD |= {"asin": INSTEAD["arcsin"], "atan2": INSTEAD["arctan2"]}
+INSTEAD |= {"asin": INSTEAD["arcsin"], "atan2": INSTEAD["arctan2"], "pow": INSTEAD["power"]}
 #: The remedy for a branch on a number.
 BRANCH = "where the form differs, branch on a field that is not a parameter, such as `spring: bool = True`"
 
@@ -605,7 +608,7 @@ class RecordedFunctions:
 
     def __getattr__(self, name: str) -> Any:
         remedy = f": write {INSTEAD[name]}" if name in INSTEAD else ""
-        if name in ("where", "abs", "sign", "minimum", "maximum", "floor", "clip"):
+        if name in ("where", "abs", "sign", "min", "max", "minimum", "maximum", "floor", "clip"):
             remedy = ": it must be smooth"
         known = "xp.sin, cos, tan, atan, tanh, sqrt, exp, log and pi"
         raise FormulaError(f"a formula uses xp.{name}; an energy has {known}{remedy}")

@@ -59,9 +59,10 @@ class SceneType(ABCMeta):
         except TypeError as error:
             fields = [field.name for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
             unknown = [name for name in keywords if name not in fields]
-            if not unknown:
+            if not (unknown or args):
                 raise
-            raise TypeError(f"{error}; {hint(unknown[0], fields)}") from None
+            remedy = hint(unknown[0], fields) if unknown else f"give {', '.join(fields)} by name"
+            raise TypeError(f"{error}; {remedy}") from None
         except dataclasses.FrozenInstanceError as error:
             raise FormulaError(
                 f"{cls.__name__}: {error}, because scenes never change; declare the numbers of a class "

@@ -178,8 +178,11 @@ def check_sequence(scene: Any, controls: ArrayLike | int) -> Array:
     if array.ndim == 1 and n == 1:
         array = array[:, None]
     if array.ndim != 2 or array.shape[1] != n:
-        wanted = "(T,)" if n == 1 else f"(T, {n}), in each row {', '.join(scene.control_names)}"
-        raise ValueError(f"controls must have shape {wanted}, got {array.shape}")
+        wanted = "(T,)" if n == 1 else f"(T, {n})"
+        raise ValueError(
+            f"controls must have shape {wanted}, with {', '.join(scene.control_names)} for each step, "
+            f"got {array.shape}"
+        )
     bad = ~np.isfinite(array)
     if bad.any():
         raise ValueError(f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}")

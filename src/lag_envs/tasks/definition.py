@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 import weakref
 from collections.abc import Mapping
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes import picture
+from lag_envs.scenes.base import SceneType
 from lag_envs.tasks.formulas import FORMULAS
 from lag_envs.tasks.imperfections import KEYWORDS
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
@@ -47,6 +49,8 @@ def check_definition(kind: type, base: type) -> None:
         )
     if kind.shapes is not base.shapes:  # type: ignore[attr-defined]
         raise FormulaError(f"{kind.__name__}.shapes: {picture.INSTEAD_OF_SHAPES}")
+    scene = kind.scene  # type: ignore[attr-defined]
+    fields = inspect.signature(scene).parameters if isinstance(scene, SceneType) else ()
     for c in kind.__mro__[: kind.__mro__.index(base)]:
         if "__dataclass_fields__" in vars(c):
             raise FormulaError(
@@ -56,6 +60,9 @@ def check_definition(kind: type, base: type) -> None:
         for name, value in vars(c).items():
             if fault := _fault(base, name, value):
                 raise FormulaError(f"{c.__name__}.{name} {fault}")
+            if name in fields and not hasattr(base, name) and not hasattr(value, "__get__"):
+                what = f"{c.__name__}.{name} does not change the scene's {name}"
+                warnings.warn(f"{what}; write defaults = {{{name!r}: ...}}", UserWarning, stacklevel=2)
     _check_kick(kind, base)
     warn_of_misspelt(kind, base, INSTEAD)
     _checked.add(kind)

@@ -621,7 +621,10 @@ def _acting(task: Task) -> list[Acting]:
     for name, given in _mapping(task, "action").items():
         where = f"{of}.action[{name!r}]"
         if name not in known:
-            raise FormulaError(f"{where}: the scene has no such control, only {', '.join(known) or 'none'}")
+            fault = f"{where}: the scene has no such control, only {', '.join(known) or 'none'}"
+            modes = [mode for mode, controls in task.scene.modes.items() if name in controls]
+            remedy = f"; write 'control': {modes[0]!r} into defaults" if modes else ""
+            raise FormulaError(fault + remedy)
         if isinstance(given, list | range) or (isinstance(given, np.ndarray) and given.ndim):
             values = _numbers_of(where, given)
             if len(set(values)) < max(2, len(values)):
@@ -662,7 +665,7 @@ def _starts(task: Task) -> dict[str, tuple[float, float]]:
         where = f"{of}.start[{name!r}]"
         if name not in found:
             raise FormulaError(f"{where}: the state has no such entry, only {', '.join(names)}")
-        if isinstance(given, tuple) and len(given) != 2:
+        if isinstance(given, list) or (isinstance(given, tuple) and len(given) != 2):
             raise FormulaError(f"{where} must be a half width or (centre, half width), got {given!r}")
         pair = _numbers_of(where, given if isinstance(given, tuple) else (0.0, given))
         _check_half_width(where, pair[1])
