@@ -223,6 +223,7 @@ def test_a_file_without_a_task(command, write, capsys):
             SCENE + TASK.replace("after.theta)", "after.phi)"),
             "Pump.reward: there is no entry of the state 'phi'",
         ),
+        (SCENE + TASK + "    def check(self):\n        {}[0]\n", "KeyError: 0"),
         (SCENE + TASK.replace('"torque": 2', '"force": 2'), "the scene has no such control, only torque"),
     ],
 )

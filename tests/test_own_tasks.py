@@ -506,6 +506,10 @@ def _guarded(function, x):
         ({"terminated": lambda self, after, target, xp: after.x}, "returns a number; it must return a truth"),
         ({"terminated": lambda self, after, target, xp: None}, "returns None; it must return a truth value"),
         ({"terminated": lambda self, after, target, xp: after.x & (after.x > 0)}, "take comparisons"),
+        (
+            {"terminated": lambda self, after, *_: after.x > 1 | after.x_dot},
+            r"terminated: &, .* in parentheses",
+        ),
         ({"reward": lambda self, b, after, *a: a[-1].where(after.x, 1.0, 0.0)}, "take comparisons"),
         ({"reward": lambda self, b, after, *_: (after.x > 0) + (b.x > 0)}, "applied to comparisons alone"),
         (
@@ -532,6 +536,10 @@ def _guarded(function, x):
         ({"defaults": ["m"]}, r"Mistaken.defaults must map names to values, as a dict does, got \['m'\]"),
         ({"imperfections": None}, "Mistaken.imperfections must map names to values, .* got None"),
         ({"controllers": {"a": 1}}, r"Mistaken.controllers must map names to Controller.*, got 1 for 'a'"),
+        (
+            {"quantities": {"x": "m"}},
+            r"Mistaken.quantities must map names to \(unit, meaning\), got 'm' for 'x'",
+        ),
         ({"draws": -1}, "Mistaken.draws must be a whole number, 0 or more, got -1"),
         ({"reward": lambda self, b, after, *_: int(after.x)}, r"no int\(\), .* write xp.floor\(x\)"),
         (

@@ -176,6 +176,8 @@ def made_with_defaults(kind: type[Any], path: str) -> Any:
         return kind()
     except (TypeError, ValueError, gym.error.Error) as error:
         raise UserError(f"{file}: {error}") from error
+    except Exception as error:  # from the class's own code
+        raise UserError(fault(file, str(Path(file).resolve()), error)) from error
 
 
 def registered(name: str) -> list[str]:

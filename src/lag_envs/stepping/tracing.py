@@ -263,8 +263,9 @@ class Trace:
         """Return the arguments of an operation, with truth values as 1 or 0 where numbers are needed."""
         conditions = args if op in LOGIC else args[: op == "where"]
         if not all(is_truth(c) or self._may_be_truth(c) for c in conditions):
-            raise TypeError(
-                "&, |, ~ and the condition of xp.where take comparisons, such as x > 0.0, not numbers"
+            raise FormulaError(
+                "&, |, ~ and the condition of xp.where take comparisons, not numbers; put each comparison in "
+                "parentheses, as in (x > 0.0) | (y > 1.0)"
             )
         others = args[len(conditions) :]
         truths = [is_truth(a) for a in others]

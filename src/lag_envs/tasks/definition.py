@@ -86,6 +86,10 @@ def _fault(base: type, name: str, value: Any) -> str:
         return f"must map names to values, as a dict does, {got}"
     if name == "controllers" and (odd := [n for n, c in value.items() if not isinstance(c, Controller)]):
         return f"must map names to Controller(...), got {value[odd[0]]!r:.60} for {odd[0]!r}"
+    if name == "quantities" and (
+        odd := [n for n, q in value.items() if not isinstance(q, tuple | list) or len(q) != 2]
+    ):
+        return f"must map names to (unit, meaning), got {value[odd[0]]!r:.60} for {odd[0]!r}"
     if name == "draws" and (type(value) is not int or value < 0):
         return f"must be a whole number, 0 or more, {got}"
     if name in KINDS and not isinstance(value, KINDS[name]):
