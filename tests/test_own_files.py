@@ -232,6 +232,20 @@ def test_mistakes_in_a_file_are_told_with_their_place(command, text, message, wr
     assert message in told(capsys, command, write(text))
 
 
+def test_refused_steps_are_told(write, capsys):
+    text = (SCENE + TASK).replace("xp.cos(q.theta)", "xp.sqrt(q.theta)")
+    error = told(capsys, "order", write(text), "--num-envs", "2", "--rounds", "1")
+    assert "the acceleration there is not finite" in error
+
+
+def test_ids_with_a_namespace_and_tasks_without_a_description(write, capsys, monkeypatch):
+    register = '\nimport lag_envs\nlag_envs.register(Pump, id="us/Pump-v0")\n'
+    path = Path(write(SCENE + TASK + register, "named.py"))
+    monkeypatch.syspath_prepend(path.parent)
+    assert main(["info", "named:us/Pump-v0"]) == 0
+    assert capsys.readouterr().out.startswith("us/Pump-v0\n\nScene: named.Swing\n")
+
+
 def test_report_needs_something_to_measure(write, capsys):
     assert "nothing to measure: it defines no scene and no task" in told(capsys, "report", write("x = 1\n"))
     broken = SCENE.replace("9.81 * self.length", "9.81 * math.pi").replace("from", "import math\nfrom", 1)

@@ -84,7 +84,14 @@ def _run(given: Sequence[str]) -> int:
     if "run" not in args:
         parser("").print_help(sys.stderr)
         return 2
-    return args.run(args)
+    try:
+        return args.run(args)
+    except ArithmeticError as error:
+        from lag_envs.scenes import StepRefused
+
+        if not isinstance(error, StepRefused):
+            raise
+        raise UserError(str(error)) from error
 
 
 if __name__ == "__main__":

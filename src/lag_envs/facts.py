@@ -36,7 +36,9 @@ def facts(task: Task, name: str, formulas: str) -> list[str]:
     """
     scene = task.scene
     states = zip(scene.state_names, scene.state_units, strict=True)
-    text = [name, "", _description(task), "", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
+    about = _description(task)
+    text = [name, "", *([about, ""] if about else [])]
+    text += [f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
     text += [f"State: {', '.join(f'{name} [{unit}]' for name, unit in states)}"]
     text += [f"Step: {task.dt:g} s; episode: {task.limit:g} steps, {task.duration:g} s"]
     text += ["", "Controls, and the actions that set them", *_indented(_controls(task))]

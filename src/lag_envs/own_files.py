@@ -27,11 +27,12 @@ def is_file(name: str) -> bool:
 
     Examples
     --------
-    >>> [is_file(name) for name in ("PivotedBar-v0", "mine.py", "mine.py:Balance", "./mine")]
-    [False, True, True, True]
+    >>> [is_file(name) for name in ("PivotedBar-v0", "us:a/Bar-v0", "mine.py", "mine.py:Balance", "./mine")]
+    [False, False, True, True, True]
     """
     path = split_path(name)[0]
-    return path.endswith(".py") or bool(re.search(r"[/\\]", path)) or Path(path).is_file()
+    is_id = re.fullmatch(r"([\w.]+:)?([\w-]+/)?[\w.-]+-v\d+", path)  # it may have a namespace
+    return path.endswith(".py") or bool(re.search(r"[/\\]", path) and not is_id) or Path(path).is_file()
 
 
 def split_path(name: str) -> tuple[str, str]:

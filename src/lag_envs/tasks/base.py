@@ -186,6 +186,8 @@ class Task(_Made):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
+        if cls.__doc__ is None and cls.__base__ is Task:  # or it would be described as "A task on a scene."
+            cls.__doc__ = ""
         for name in ("defaults", "action", "start", "target", "usable", "imperfections"):
             if isinstance(vars(cls).get(name), Mapping):
                 setattr(cls, name, MappingProxyType(dict(vars(cls)[name])))
