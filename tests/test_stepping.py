@@ -19,6 +19,7 @@ from reference import (
     VARIANTS,
     conditioning,
     flow,
+    linear,
     moving_plane,
     random_cases,
     scales,
@@ -29,7 +30,7 @@ from scipy.integrate import solve_ivp
 from lag_envs import scenes
 from lag_envs.report import reference as exact_ends
 from lag_envs.report.bound import driven
-from lag_envs.report.closed_forms import elliptic, linear
+from lag_envs.report.closed_forms import elliptic
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, Scene, StepRefused, parameter
 from lag_envs.scenes.derivation import form_of, motion_constants_of
@@ -545,8 +546,8 @@ def test_refused_step_keeps_the_rows_before():
     [
         ([0.0, 0.0], [1.0, math.nan], 0.02, "controls must be finite, got nan in row 1"),
         ([0.0, 0.0], [math.inf], 0.02, "controls must be finite, got inf in row 0"),
-        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), got \(\)"),
-        ([0.0, 0.0], [[1.0, 2.0]], 0.02, r"shape \(T,\), got \(1, 2\)"),
+        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), with s_ddot for each step, got \(\)"),
+        ([0.0, 0.0], [[1.0, 2.0]], 0.02, r"shape \(T,\), with s_ddot for each step, got \(1, 2\)"),
         ([0.0, 0.0], ["one"], 0.02, "controls must be real numbers"),
         ([0.0, 0.0, 0.0], [1.0], 0.02, r"state must be \(theta, theta_dot\), got .* \(3,\)"),
         ([0.0, math.nan], [1.0], 0.02, "state must be finite, got .*theta_dot"),
