@@ -71,6 +71,10 @@ def test_torch_func(step):
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         (once,) = torch.autograd.grad(step(states, actions).rewards.sum(), states, create_graph=True)
         once.sum().backward()
+    envs = TorchVectorEnv(step.task.id, 3)
+    envs.reset(seed=0)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        torch.autograd.grad(envs.step(actions)[1].sum(), actions, create_graph=True)
     for forward in (torch.func.jacfwd, torch.func.hessian):
         with pytest.raises(NotImplementedError, match="no forward mode and no second derivatives"):
             forward(lambda s: step(s, actions[0]).rewards)(states[0])
@@ -326,6 +330,17 @@ def test_errors(step):
         step(states.long(), actions)
     with pytest.raises(ValueError, match="states must be on the CPU, got a tensor on meta"):
         step(states.to("meta"), actions)
+    with pytest.raises(TypeError, match=r"states must be dense, .* torch\.sparse_coo; call \.to_dense\(\)"):
+        step(states.to_sparse(), actions)
+    bar = step.task.scene
+    for given, reason in [
+        (states.to_sparse(), r"Use Tensor\.to_dense\(\) first"),
+        (states.clone().requires_grad_(), r"Use tensor\.detach\(\)\.numpy\(\) instead"),
+    ]:
+        with pytest.raises(ValueError, match=rf"(?s)state must be real numbers, got tensor.*{reason}"):
+            bar.vjp(given, actions, 0.02, states)
+        with pytest.raises(ValueError, match=rf"(?s)cotangent must be real numbers, got tensor.*{reason}"):
+            bar.vjp(states, actions, 0.02, given)
     with pytest.raises(ValueError, match=r"states must be finite, got .* in row 1"):
         step(states * torch.tensor([[1.0], [float("nan")]]), actions)
     with pytest.raises(ValueError, match="list of actions to choose from"):

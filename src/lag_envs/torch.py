@@ -44,6 +44,8 @@ from lag_envs.tasks.base import Task
 
 Tensor = torch.Tensor
 
+FIRST_ONLY = "a step has first derivatives only; leave out create_graph=True"
+
 
 class StepResult(NamedTuple):
     """The result of a step.
@@ -341,7 +343,7 @@ class TorchVectorEnv:
             As `LagrangianVectorEnv.set_state` does; ValueError also on a GPU.
         """
         envs, before = self._on_cpu(), self._before(mask)
-        envs.set_state(snapshot, mask.numpy() if isinstance(mask, Tensor) else mask)
+        envs.set_state(snapshot, _plain(mask))
         self._keep(torch.from_numpy(envs.state), before, mask)
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -490,7 +492,7 @@ class _RowStepBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *seeds: Tensor) -> tuple:
-        raise NotImplementedError("a step has first derivatives only; leave out create_graph=True")
+        raise NotImplementedError(FIRST_ONLY)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
@@ -522,8 +524,9 @@ class _EnvStep(torch.autograd.Function):
         return observations, rewards, after, terminated, truncated
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple:
+        if torch.is_grad_enabled():  # torch's `once_differentiable` would drop some of the second derivatives
+            raise NotImplementedError(FIRST_ONLY)
         model, waiting, begun = ctx.model, ctx.waiting, ctx.begun
         y, a, ends = (x.detach().numpy() for x in ctx.saved_tensors)
         task = model.task
@@ -615,6 +618,8 @@ def _check(name: str, x: Any, shape: tuple[int, ...], *, whole: bool = False) ->
         raise TypeError(f"{name} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
     if x.device.type != "cpu":
         raise ValueError(f"{name} must be on the CPU, got a tensor on {x.device}; call .cpu()")
+    if x.layout != torch.strided:
+        raise TypeError(f"{name} must be dense, got a tensor of layout {x.layout}; call .to_dense()")
     if x.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"{name} must be float32 or float64, got {x.dtype}")
     last = len(shape) == 1 and not whole

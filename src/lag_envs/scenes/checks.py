@@ -70,9 +70,9 @@ def check_number(name: str, value: Any, unit: str = "", *, endless: bool = False
 def real_array(name: str, values: ArrayLike) -> Array:
     """Return values as a new float64 array, or raise a ValueError with their name."""
     try:
-        array = np.array(values)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} must be real numbers, got {shown(values)}") from error
+        array = np.asarray(values)
+    except (ValueError, TypeError, RuntimeError) as error:  # rows of different lengths, sparse tensors
+        raise ValueError(f"{name} must be real numbers, got {shown(values)}: {error}") from error
     if array.dtype.kind not in "fiu" or is_masked(values):
         raise ValueError(f"{name} must be real numbers, got {shown(values)}")
     return array.astype(np.float64)
