@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.derivation import code_of, form_of
-from lag_envs.scenes.steps import check_turns, vjp_of_rows
+from lag_envs.scenes.steps import check_turns, derivatives_of, vjp_of_rows
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
 from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.normal_forms import lifted
@@ -56,13 +56,22 @@ class Reverse:
                 f"{type(task).__name__} has a list of actions to choose from; choices have no derivatives"
             )
         constants = task.formulas.constants()
+        # Formulas may use the normal form's constants (`Task.coefficients`), which depend on parameters too.
+        rates = derivatives_of(task.scene, parameters).rates if parameters else {}
+        self._moving = [name for name in rates if name in constants]
+        constants |= {
+            f"rate_{name}_{p}": x
+            for name in self._moving
+            for p, x in zip(parameters, rates[name], strict=True)
+        }
         self._constants = [f"k_{name}" for name in constants]
         self._numbers = np.array([*constants.values()])
         self._absent = {f"k_{name}" for name, value in constants.items() if value == 0.0}
         sizes = {"y": len(formulas.state), "a": formulas.actions, "g": formulas.targets}
         sizes |= {"z": sizes["y"], "u": formulas.controls, "e": sizes["y"]}
         sizes |= {"by_e": sizes["y"], "by_o": len(formulas.observation), "by_r": 1, "by_u": sizes["u"]}
-        sizes |= {"own_y": sizes["y"], "own_u": sizes["u"], "own_g": sizes["g"], "own_p": len(parameters)}
+        sizes |= {"own_y": sizes["y"], "own_u": sizes["u"], "own_g": sizes["g"]}
+        sizes["own_p"] = len(parameters) + len(self._moving)
         sizes |= {"moved": sizes["y"] + sizes["u"] + len(parameters)}
         self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
         self._form = form_of(task.scene)
@@ -164,7 +173,10 @@ class Reverse:
         return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
 
     def _parameters_of(self, k: Any) -> list:
-        return [getattr(k, f"self_{name}") for name in self._parameters]
+        """Return the parameters, and the constants that depend on them."""
+        return [getattr(k, f"self_{name}") for name in self._parameters] + [
+            getattr(k, name) for name in self._moving
+        ]
 
     def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list:
         top = self._formulas.largest
@@ -221,7 +233,10 @@ class Reverse:
         bars = _sums(found["own_u"], by_u)
         own = xp.adjoint(self._control_of(xp, k, y, a, g), bars, [x for numbers in by for x in numbers])
         last_y, last_a, last_g, last_p = split_lengths(own, *map(len, by[:-1]))
-        by_y, by_p = _sums(found["own_y"], by_y, last_y), _sums(found["own_p"], by_p, last_p)
+        (own_p, own_c), (last_p, last_c) = (split_lengths(x, len(by_p)) for x in (found["own_p"], last_p))
+        by_y, by_p = _sums(found["own_y"], by_y, last_y), _sums(own_p, by_p, last_p)
+        for name, bar in zip(self._moving, _sums(own_c, last_c), strict=True):
+            by_p = _sums(by_p, [bar * getattr(k, f"rate_{name}_{p}") for p in self._parameters])
         return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
 
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:

@@ -156,7 +156,7 @@ def jacobian(
     """See `Scene.jacobian`."""
     states, controls, shape = _rows(scene, state, control)
     by = check_parameters(scene, parameters or ())
-    found, refused = _derivatives(scene, by).jacobian(states, controls, check_step(dt))
+    found, refused = derivatives_of(scene, by).jacobian(states, controls, check_step(dt))
     n, m = states.shape[1], controls.shape[1]
     _check_refused(scene, states, controls, dt, refused)
     found = found.reshape(*shape, n, n + m + len(by))
@@ -212,7 +212,7 @@ def vjp_of_rows(
 
     Rows are not finite where their cotangents are not, or are too large.
     """
-    derivatives = _derivatives(scene, by)
+    derivatives = derivatives_of(scene, by)
     found, refused = derivatives.vjp(states, controls, dt, cotangents)
     if not refused and not np.isfinite(found).all():
         (bad,) = np.nonzero(~np.isfinite(found).all(axis=1))
@@ -269,13 +269,17 @@ def _check_refused(
 
 
 class _Derivatives(NamedTuple):
-    """Derivatives of steps by rows: ``jacobian(states, controls, dt)``, ``vjp(..., cotangents)``."""
+    """Derivatives of steps by rows: ``jacobian(states, controls, dt)``, ``vjp(..., cotangents)``.
+
+    `rates` has those of the normal form's constants with respect to the parameters, if there is such a form.
+    """
 
     jacobian: Callable[[Array, Array, float], tuple[Any, int]]
     vjp: Callable[[Array, Array, float, Array], tuple[Any, int]]
+    rates: Mapping[str, Sequence[float]]
 
 
-def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
+def derivatives_of(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     """Return the derivatives of steps with respect to states, controls and parameters."""
     known = vars(scene).setdefault("_cached_derivatives", {})
     if by in known:
@@ -292,12 +296,14 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
             known[by] = _Derivatives(
                 lambda y, u, dt: form.jacobian(y, u, constants, dt, rates, len(by)),
                 lambda y, u, dt, seeds: form.vjp(y, u, constants, dt, seeds, rates, len(by)),
+                rates,
             )
         else:
             tangent = stepper_of(mechanics).tangent(parameters, by)
             known[by] = _Derivatives(
                 lambda y, u, dt: tangent.jacobian(y, u, dt, series_order_of(scene, dt)),
                 lambda y, u, dt, seeds: tangent.vjp(y, u, dt, series_order_of(scene, dt), seeds),
+                {},
             )
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={parameters[name]:g}" for name in by)
