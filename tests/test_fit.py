@@ -475,6 +475,7 @@ STATES = np.linspace(0.0, 1.0, 40).reshape(20, 2)
         (STATES, {}, r"a list of at least one \(states, controls, dt\), got an array of shape \(20, 2\)$"),
         ([(np.ma.masked_invalid(STATES), None, DT)], {}, r"got a masked array; call filled\(np.nan\)$"),
         ([([[1.0, None]] * 9, None, DT)], {}, r"a list of 9; np.array\(states, float\) makes NaN of None"),
+        ([([[1.0, 2.0], [1.0]], None, DT)], {}, "got a list of 2: setting an array element with a sequence"),
         ([(STATES.astype(object), None, DT)], {}, "got an array of type object; np.array"),
         ([(STATES + 0j, None, DT)], {}, "NaN for what was not measured, got an array of type complex128$"),
         ((STATES, None, DT), {}, r"\(states, controls, dt\), got a single recording; put it into a list$"),

@@ -108,10 +108,12 @@ def _numbers(states: Any) -> Array:
     """Return states as float64 array, or raise a ValueError with the remedy."""
     try:
         return real_array("states", states)
-    except ValueError:
+    except ValueError as error:
         kind, remedy = _kind(states), "; np.array(states, float) makes NaN of None"
         if is_masked(states):
             kind, remedy = "a masked array", "; call filled(np.nan)"
+        elif error.__cause__:
+            remedy = f": {error.__cause__}"
         elif isinstance(states, np.ndarray):
             kind, remedy = f"an array of type {states.dtype}", remedy if states.dtype == object else ""
         raise ValueError(
