@@ -85,6 +85,24 @@ def test_a_step_of_a_class(step):
     assert found.task.scene.damping == 0.1 and type(found.task) is type(step.task)
 
 
+def test_negated_views(step):
+    """As actions, and as the gradient that torch passes to a step from complex numbers."""
+    states, actions = near(2)
+    envs = TorchVectorEnv(IDS[0], 2)
+    envs.reset(seed=0)
+    start = envs.get_state()
+    for rewards in (step(states, actions).rewards, envs.step(actions)[1]):
+        turned = torch.complex(torch.zeros_like(rewards), rewards).conj().imag
+        (slope,) = torch.autograd.grad(turned.sum(), actions, retain_graph=True)
+        assert torch.equal(slope, -torch.autograd.grad(rewards.sum(), actions)[0])
+    found = step(states, torch._neg_view(actions)).rewards
+    assert torch.equal(found, step(states, -actions).rewards)
+    envs.set_state(start)
+    found = envs.step(torch._neg_view(actions.detach()))[1]
+    envs.set_state(start)
+    assert torch.equal(found, envs.step(-actions.detach())[1])
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies(step, copied):
     """Of what has derivatives compiled, and of states with a history."""

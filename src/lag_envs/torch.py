@@ -424,7 +424,7 @@ class TorchVectorEnv:
 
     def _advance(self, actions: Tensor) -> list[Any]:
         assert isinstance(self.envs, LagrangianVectorEnv)
-        *results, self._infos = self.envs.step(actions.detach().numpy())
+        *results, self._infos = self.envs.step(actions.numpy(force=True))
         return list(results)
 
 
@@ -532,7 +532,7 @@ class _EnvStep(torch.autograd.Function):
         task = model.task
         shapes = (len(y), len(task.formulas.observation)), (len(y),), y.shape
         by_observations, by_rewards, by_states = (
-            np.broadcast_to(0.0, shape) if seed is None else seed.detach().numpy()
+            np.broadcast_to(0.0, shape) if seed is None else seed.numpy(force=True)
             for seed, shape in zip(seeds, shapes, strict=False)
         )
         y, ends = (_replaced(x, waiting, task.centre) for x in (y, ends))
@@ -572,7 +572,7 @@ def _plain(value: Any) -> Any:
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:
-    return x.detach().to(torch.float64).numpy()
+    return x.to(torch.float64).numpy(force=True)  # of views that are negated or conjugated too
 
 
 def _rows(model: Model, states: Tensor, actions: Tensor, targets: Tensor) -> tuple[Any, Any, Any]:
