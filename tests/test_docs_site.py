@@ -2,7 +2,7 @@
 
 import os
 import re
-from html import escape
+from html import escape, unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from browsers import serious, until
+from fontTools.ttLib import TTFont
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
@@ -18,6 +19,7 @@ from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes import SCENES
 from lag_envs.tasks import TASKS, acrobot, chain
 from tools.docs import equations
+from tools.docs.font import CHARACTERS, FILE
 
 ROOT = Path(__file__).parents[1]
 #: Attributes by which a page loads something; other elements with an address only link to it.
@@ -169,7 +171,7 @@ def test_links_lead_somewhere(site, pages):
 
 @pytest.mark.slow
 def test_what_is_bundled_is_noticed(site):
-    """NOTICE.md covers each third-party script and style."""
+    """NOTICE.md covers each third-party script, style and font."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
     own_files = {"docs.css", "docs.js"}
     for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
@@ -177,25 +179,31 @@ def test_what_is_bundled_is_noticed(site):
         if place.parts[0] in ("board", "search") or path.name in own_files:
             continue
         assert place.parts[0] == "assets", place
-    for name in ("Material for MkDocs", "iframe-worker", "lunr", "RxJS", "clipboard.js", "Icons"):
+    for name in ("Material for MkDocs", "iframe-worker", "lunr", "RxJS", "clipboard.js", "Icons", "STIX"):
         assert name in notice
-    assert not list(site.rglob("*.woff*")) and not list(site.rglob("*.ttf"))
+    (font,) = [path for kind in ("woff*", "ttf", "otf") for path in site.rglob(f"*.{kind}")]
+    assert font == site / FILE and font.stat().st_size < 100_000
+    assert "Open Font License" in TTFont(font)["name"].getDebugName(13)
 
 
 @pytest.mark.slow
 def test_formulas_are_whole(site):
     """Each element has the required number of parts, and each formula includes its LaTeX."""
-    parts = {"msup": 2, "msub": 2, "mfrac": 2, "mover": 2, "msubsup": 3}
+    parts = {"msup": 2, "msub": 2, "mfrac": 2, "mover": 2, "munder": 2, "msubsup": 3, "munderover": 3}
     found = []
-    for name in ("scenes.html", *(f"environments/{env_id}.html" for env_id in TASKS)):
+    written = ("numerics.html", "engine.html", "physics.html", "scenes.html")
+    for name in (*written, *(f"environments/{env_id}.html" for env_id in TASKS)):
         text = (site / name).read_text("utf-8")
         wide = re.findall('<div class="equation".*?</div>', text, re.DOTALL)
         alone = re.findall(
             r"<math.*?</math>", re.sub('<div class="equation".*?</div>', "", text, flags=re.DOTALL)
         )
         assert all(one.count("</annotation>") == 1 for one in (*wide, *alone))
+        assert wide and "$$" not in text, name
         found += [*alone, *(part for one in wide for part in re.findall(r"<math.*?</math>", one, re.DOTALL))]
     assert len(found) > 3 * len(TASKS)
+    shown = re.sub("<annotation.*?</annotation>|<[^>]*>", "", unescape("".join(found)))
+    assert {x for x in shown if not x.isspace()} <= {*CHARACTERS}
     for formula in map(ElementTree.fromstring, found):
         elements = [(element.tag.rpartition("}")[2], element) for element in formula.iter()]
         assert all(len(element) == parts.get(tag, len(element)) for tag, element in elements)

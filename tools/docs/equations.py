@@ -165,4 +165,10 @@ def _body(latex: str) -> str:
     )
     space = '<mspace width="0.17em"></mspace>'
     body = re.sub(r"<mi>(sin|cos|tan|arctan)</mi>", rf"<mrow>{space}\g<0>{space}</mrow>", body)
+    # A sign after "=" or "(", where MathML would set a minus between terms.
+    body = re.sub(r"((?:&#x0003D;|&#x00028;)</mo><mo)(>&#x02212;)", r'\1 form="prefix"\2', body)
+    # Primes are raised by themselves.
+    body = re.sub(
+        r"<msup>((?:(?!<msup>).)*?<)mi(>&#x0203[23];<)/mi></msup>", r"<mrow>\1mi\2/mi></mrow>", body
+    )
     return re.sub(r"<mover>.*?</mover>", rf"{LOW}\g<0></mpadded>", body)

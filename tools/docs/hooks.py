@@ -63,10 +63,12 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages, and pages from the root."""
+    from tools.docs.font import FILE, math_font
+
     texts = generated() | {
         place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_FILES.items()
     }
-    for place, content in (texts | board_pages(config) | stills()).items():
+    for place, content in (texts | board_pages(config) | stills() | {FILE: math_font()}).items():
         files.append(File.generated(config, place, content=content))
     return files
 
@@ -116,9 +118,13 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fill in the scenes' names, and redirect links out of the folder docs to the site or to the source."""
+    """Fill in formulas and the scenes' names, and redirect links out of the folder docs to site or source."""
     from lag_envs.scenes import SCENES
+    from tools.docs.equations import formula_mathml
 
+    markdown = re.sub(
+        r"^\$\$\n(.+?)\n\$\$$", lambda found: formula_mathml(found[1]), markdown, flags=re.MULTILINE
+    )
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))
     markdown = markdown.replace("members: SCENES\n", f"members: [{names}]\n")
     about = config.extra["descriptions"].get(page.file.src_uri) or description(page, markdown)
