@@ -502,7 +502,7 @@ def test_numbers_in_the_prose():
     ((own, _),), rivals = own_step(accuracy)
     assert 1e-12 in {error for time, error in rivals["DOP853"] if time < own}
     said = {
-        "README.md": ["Where an error of 1e-12 is enough, DOP853 is faster in the left panel."],
+        "README.md": ["enough, DOP853, a Runge-Kutta method of order 8, is faster in the left panel."],
         "docs/accuracy.md": [f"doubles an error every {doubling:.2f} s", "more than a million substeps"],
         "docs/numerics.md": [
             f"more than {pendulum.MAX_SUBSTEPS:,} substeps",

@@ -49,7 +49,9 @@ def _range(acting: Any) -> str:
 
 def declare_info(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``info``."""
-    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN_OR_MODULE}")
+    parser.add_argument(
+        "id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN_OR_MODULE}"
+    )
 
 
 def run_info(args: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from lag_envs.tasks.registration import make_task
 
 def declare_order(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``order``."""
-    parser.add_argument("id", metavar="ID", help=f"an environment, or {OWN_OR_MODULE}")
+    parser.add_argument("id", metavar="ID|FILE", help=f"an environment, or {OWN_OR_MODULE}")
     parser.add_argument(
         "--num-envs", metavar="N", type=count, default=1024, help="size of the batch (default: 1024)"
     )

@@ -1,13 +1,27 @@
-"""Goals as readers see them: a board's log freezes their texts, one phrase of which reads badly."""
+"""Goals as readers see them: a board's log freezes their texts, some phrases of which read badly."""
 
 from __future__ import annotations
 
-FROZEN, PLAIN = "until it is so for good", "until it stays there"
+FROZEN = "until it is so for good"
+#: Frozen phrases, and those that readers see.
+PHRASES = {
+    FROZEN: "until it stays there",
+    ", and time: ": "; time: ",
+    "the project's swing-up time": "RealAIGym's swing-up time",
+}
 
 
 def goal_text(goal: str) -> str:
-    """Return a goal as a sentence."""
-    return goal[0].upper() + goal[1:].replace(FROZEN, PLAIN)
+    """Return a goal as a sentence.
+
+    Examples
+    --------
+    >>> goal_text("success: up, and time: until it is so for good")
+    'Success: up; time: until it stays there'
+    """
+    for frozen, plain in PHRASES.items():
+        goal = goal.replace(frozen, plain)
+    return goal[0].upper() + goal[1:]
 
 
 def goal_by_column(goal: str | None) -> dict[str, str]:
@@ -24,7 +38,6 @@ def goal_by_column(goal: str | None) -> dict[str, str]:
     """
     if not goal:
         return {}
-    joined = goal.removeprefix("success: ").replace(", and time: ", "; time: ")
-    success, _, time = joined.partition("; time: ")
-    time = time.removeprefix(FROZEN).removeprefix(", ").replace("until then", "until success")
+    success, _, time = goal_text(goal).removeprefix("Success: ").partition("; time: ")
+    time = time.removeprefix(PHRASES[FROZEN]).removeprefix(", ").replace("until then", "until success")
     return {"success": success.removesuffix("; there is no time")} | ({"settle": time} if time else {})

@@ -33,7 +33,7 @@ DETAILS = "accuracy-details.md"
 OVERVIEW = ReportFigure(
     "overview",
     "Error against run time. The shortest time of one control step in which each method reaches an error, "
-    "with only the state, not in a batch. Rivals are in their fastest form.",
+    "for a single state, not a batch. Rivals are in their fastest form.",
     lambda: overview.draw_overview({}),
     raster=True,
 )
