@@ -6,6 +6,7 @@ import io
 import posixpath
 import re
 import sys
+from collections.abc import Callable
 from functools import cache
 from html import escape, unescape
 from pathlib import Path
@@ -114,7 +115,8 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
         r'srcset="\1-still.webp">\g<0></picture></span>',
         html,
     )
-    return with_minus(with_lazy_pictures(html))
+    html = with_minus(with_lazy_pictures(html))
+    return with_indices(html) if page.meta["formulas"] else html
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -122,7 +124,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     from lag_envs.scenes import SCENES
     from tools.docs.equations import formula_mathml
 
-    markdown = re.sub(
+    markdown, page.meta["formulas"] = re.subn(
         r"^\$\$\n(.+?)\n\$\$$", lambda found: formula_mathml(found[1]), markdown, flags=re.MULTILINE
     )
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))
@@ -165,9 +167,33 @@ def with_minus(html: str) -> str:
     >>> with_minus("<td>-1266.5, 1e-6, 2026-11-26 <code>-1</code></td>")
     '<td>−1266.5, 1e-6, 2026-11-26 <code>-1</code></td>'
     """
+    return _changed(html, lambda text: re.sub(r"(?<![\w.-])-(?=[\d∞])", "−", text))
+
+
+def with_indices(html: str) -> str:
+    """Return HTML with the indices and exponents of formulas in the text set as such.
+
+    Examples
+    --------
+    >>> with_indices("<p>v_{k+1} and e^-x <code>x_1</code></p>")
+    '<p>v<sub>k+1</sub> and e<sup>−x</sup> <code>x_1</code></p>'
+    """
+
+    def element(name: str) -> Callable[[re.Match], str]:
+        return lambda found: f"<{name}>{found[1].strip('{}').replace('-', '−')}</{name}>"
+
+    def change(text: str) -> str:
+        text = re.sub(r"(?<=(?<![A-Za-z_])[A-Za-zͰ-Ͽ∂])_({[^}]+}|\w+)", element("sub"), text)
+        return re.sub(r"\^({[^}]+}|-?\([^)]+\)|-?[\w¼]+)", element("sup"), text)
+
+    return _changed(html, change)
+
+
+def _changed(html: str, change: Callable[[str], str]) -> str:
+    """Return HTML whose texts are changed, except in code."""
     parts = re.split(r"(<(code|annotation)\b.*?</\2>|<[^>]*>)", html, flags=re.DOTALL)
     # The texts; after each text come two groups: code or a tag, and the name in it.
-    parts[::3] = [re.sub(r"(?<![\w.-])-(?=[\d∞])", "−", text) for text in parts[::3]]
+    parts[::3] = [change(text) for text in parts[::3]]
     return "".join(text for i, text in enumerate(parts) if i % 3 != 2 and text)
 
 
