@@ -40,21 +40,26 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, id, tmp_path):
         data["environments"][0]["rows"][0]["agent"] = agent(made(id, *BESIDE[id]))
     write_page(data, tmp_path)
     drives = (frames(drive(id, folder=tmp_path), id in BESIDE) for _ in range(3))
-    assert any(np.quantile(scripts, 0.99) <= 8.0 and np.median(whole) <= 8.0 for scripts, whole in drives)
+    assert any(
+        len(whole) > 30 and np.quantile(scripts, 0.99) <= 8.0 and np.median(whole) <= 8.0
+        for scripts, whole in drives
+    )
 
 
 @pytest.mark.slow
 def test_so_does_the_frame_in_which_an_episode_ends(drive, tmp_path):
     write_page(board_pages.data(("PivotedBar-v0",), board_pages.AGENTS[:1]), tmp_path)
     drives = (frames(drive("PivotedBar-v0", folder=tmp_path), to_the_end=True) for _ in range(3))
-    assert any(max(scripts) <= 8.0 for scripts, _ in drives)
+    assert any(max(scripts[-10:]) <= 8.0 for scripts, _ in drives)  # the ten last frames: it is among them
 
 
 def frames(page, ghost=False, to_the_end=False):
     """Return the main thread's time of each frame while keys are pressed, throttled four times [ms].
 
-    First of scripts alone, then of all work: scripts, layout and painting.
+    First of scripts alone, then of all work (scripts, layout and painting) unless the drive goes on to the
+    end, because tracing all tasks takes time too.
     """
+    categories = ["devtools.timeline"] if to_the_end else ["devtools.timeline", "toplevel"]
     if ghost:
         page.select_option(".drive-controls select >> nth=1", "live:0")
     cdp = page.context.new_cdp_session(page)
@@ -62,7 +67,7 @@ def frames(page, ghost=False, to_the_end=False):
     page.focus(".stage")
     page.keyboard.press("Space")
     page.wait_for_timeout(2000 if to_the_end else 500)  # the first frames also compile
-    page.context.browser.start_tracing(page=page, categories=["devtools.timeline", "toplevel"])
+    page.context.browser.start_tracing(page=page, categories=categories)
     for i in range(8):
         if page.text_content(".go") == "Start again" and not to_the_end:
             page.keyboard.press("r")  # short episodes have too few frames
@@ -77,6 +82,7 @@ def frames(page, ghost=False, to_the_end=False):
     # Numbers that change are painted on a canvas, not laid out as text; a restart lays out some.
     layouts = sum(e["name"] == "Layout" for e in events)
     called = [e for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e]
+    called.sort(key=lambda e: e["ts"])
     tasks = [e for e in events if e["name"] == "ThreadControllerImpl::RunTask" and "tdur" in e]
 
     def holds(task, call):
@@ -85,8 +91,10 @@ def frames(page, ghost=False, to_the_end=False):
 
     scripts = np.array([call["tdur"] / 1e3 for call in called])
     whole = np.array([t["tdur"] / 1e3 for t in tasks if any(holds(t, call) for call in called)])
-    for name, took in (("scripts", scripts), ("whole frames", whole)):
+    for name, took in {"scripts": scripts, "whole frames": whole}.items():
+        if not len(took):
+            continue
         median, most, longest = np.quantile(took, [0.5, 0.99, 1.0])
         print(f"{len(took)} {name} [ms]: median {median:.2f}, 99 % {most:.2f}, longest {longest:.2f}")
-    assert len(whole) > 30 and layouts < 0.1 * len(whole)
+    assert len(scripts) > 30 and layouts < 0.1 * len(scripts)
     return scripts, whole
