@@ -50,7 +50,7 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, id, tmp_path):
 def test_so_does_the_frame_in_which_an_episode_ends(drive, tmp_path):
     write_page(board_pages.data(("PivotedBar-v0",), board_pages.AGENTS[:1]), tmp_path)
     drives = (frames(drive("PivotedBar-v0", folder=tmp_path), to_the_end=True) for _ in range(3))
-    assert any(max(scripts[-10:]) <= 8.0 for scripts, _ in drives)  # the ten last frames: it is among them
+    assert any(max(scripts) <= 8.0 for scripts, _ in drives)
 
 
 def frames(page, ghost=False, to_the_end=False):
@@ -82,7 +82,6 @@ def frames(page, ghost=False, to_the_end=False):
     # Numbers that change are painted on a canvas, not laid out as text; a restart lays out some.
     layouts = sum(e["name"] == "Layout" for e in events)
     called = [e for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e]
-    called.sort(key=lambda e: e["ts"])
     tasks = [e for e in events if e["name"] == "ThreadControllerImpl::RunTask" and "tdur" in e]
 
     def holds(task, call):

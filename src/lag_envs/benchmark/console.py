@@ -72,25 +72,25 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if "steps_per_second" not in row:
         return (*name, row["problem"] or "not measured")
     rates = row["steps_per_second"]
-    cells: tuple[str, ...] = (*name, *_spread(rates, rate_text), f"{1e9 / rates[1]:,.1f}")
+    cells: tuple[str, ...] = (*name, *_quartiles(rates, rate_text), f"{1e9 / rates[1]:,.1f}")
     if "ratio" in row:
-        cells += _spread(row["ratio"], "{:.2f}".format)
+        cells += _quartiles(row["ratio"], "{:.2f}".format)
     return (*cells, row["problem"]) if row["problem"] else cells
 
 
-def _spread(quartiles: Sequence[float], text: Callable[[float], str]) -> tuple[str, str]:
+def _quartiles(quartiles: Sequence[float], text: Callable[[float], str]) -> tuple[str, str]:
     """Return the median and, in brackets, the other quartiles."""
     low, middle, high = map(text, quartiles)
     return middle, f"({low} - {high})"
 
 
 def _compared(row: dict[str, Any]) -> tuple[str, ...]:
-    return row["id"], f"{row['num_envs']:,}", *_spread(row["ratio"], "{:.2f}".format)
+    return row["id"], f"{row['num_envs']:,}", *_quartiles(row["ratio"], "{:.2f}".format)
 
 
 def _share(row: dict[str, Any]) -> tuple[str, ...]:
     numbers = f"{row['num_envs']:,}", f"{row['products']:,}"
-    return row["id"], *numbers, *_spread(row["share"], "{:.0%}".format)
+    return row["id"], *numbers, *_quartiles(row["share"], "{:.0%}".format)
 
 
 def _worst(target: dict[str, Any]) -> str:

@@ -193,7 +193,7 @@ function open(root, board, code, tools) {
   const copy = button("copy", "Copy link");
   const share = make("div", { class: "share" }, link, copy);
   const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
-  // Browsers that follow this hint show a key's effect sooner, and without a GPU they paint in half the time.
+  // Browsers that follow this hint show a key's effect sooner, and skip work of their compositor.
   for (const painted of [canvas, values]) painted.getContext("2d", { desynchronized: true });
   root.replaceChildren(verdict, stage, bar, make("div", { class: "numbers" }, readout, values), share, panel, said);
   copy.disabled = watch.hidden = episodeLabel.hidden = true;
