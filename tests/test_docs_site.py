@@ -202,7 +202,7 @@ def test_formulas_are_whole(site):
         assert wide and "$$" not in text, name
         found += [*alone, *(part for one in wide for part in re.findall(r"<math.*?</math>", one, re.DOTALL))]
     assert len(found) > 3 * len(TASKS)
-    shown = re.sub("<annotation.*?</annotation>|<[^>]*>", "", unescape("".join(found)))
+    shown = unescape(re.sub("<annotation.*?</annotation>|<[^>]*>", "", "".join(found)))
     assert {x for x in shown if not x.isspace()} <= {*CHARACTERS}
     for formula in map(ElementTree.fromstring, found):
         elements = [(element.tag.rpartition("}")[2], element) for element in formula.iter()]
@@ -228,13 +228,14 @@ def test_pages_are_published_only_when_switched_on():
 def test_in_a_browser(site, browser):
     """No page requests anything outside its folder, search works offline, and pages fit a narrow screen."""
     asked = []
-    page = browser.new_page(viewport={"width": 360, "height": 800})
+    page = browser.new_page(viewport={"width": 320, "height": 800})
     page.on("request", lambda r: asked.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
     page.on("pageerror", lambda error: asked.append(str(error)))
     env_id = next(iter(TASKS))
-    for name in ("index", f"environments/{env_id}", "scenes", "accuracy", "api/scenes"):
+    formulas = ("numerics", "engine", "physics")
+    for name in ("index", f"environments/{env_id}", "scenes", "accuracy", "api/scenes", *formulas):
         page.goto(f"{site.as_uri()}/{name}.html")
-        assert page.evaluate("document.documentElement.scrollWidth") <= 360, name
+        assert page.evaluate("document.documentElement.scrollWidth") <= 320, name
     page.set_viewport_size({"width": 1280, "height": 900})
     page.goto(f"{site.as_uri()}/index.html")
     page.get_by_role("textbox", name="Search").fill("truncation bound")

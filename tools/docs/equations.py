@@ -163,8 +163,14 @@ def _body(latex: str) -> str:
         lambda word: "<mtext>" + re.sub(r"<[^>]+>", "", word[0]) + "</mtext>",
         body,
     )
+    # A thin space around a function's name, unless a bracket or an exponent follows.
     space = '<mspace width="0.17em"></mspace>'
-    body = re.sub(r"<mi>(sin|cos|tan|arctan)</mi>", rf"<mrow>{space}\g<0>{space}</mrow>", body)
+    body = re.sub("<mo>(max|min)</mo>", r"<mi>\1</mi>", body)
+    functions = r"(?<!<ms[bu][bp]>)(<mi>(?:sin|cos|tan|arctan|log|exp|max|min)</mi>)"
+    body = re.sub(rf"{functions}(?!<mo[^>]*>&#x00028;)", rf"<mrow>{space}\1{space}</mrow>", body)
+    body = re.sub(rf"{functions}(?=<mo)", rf"<mrow>{space}\1</mrow>", body)
+    # Bars and fractions within a line are set tight.
+    body = re.sub("<mo([^>]*)>(?=(?:/|&#x0007C;|&#x0002F;)</mo>)", r'<mo\1 lspace="0" rspace="0">', body)
     # A sign after "=" or "(", where MathML would set a minus between terms.
     body = re.sub(r"((?:&#x0003D;|&#x00028;)</mo><mo)(>&#x02212;)", r'\1 form="prefix"\2', body)
     # Primes are raised by themselves.

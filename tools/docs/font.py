@@ -20,7 +20,7 @@ SOURCE = Path(str(distribution("ziamath").locate_file("ziamath/fonts/STIXTwoMath
 CHARACTERS = (
     *map(chr, (*range(0x20, 0x7F), *range(0x391, 0x3D6), *range(0x1D434, 0x1D468), *range(0x1D6E2, 0x1D71C))),
     *"\N{PLANCK CONSTANT}\N{SCRIPT CAPITAL L}∂∑∞√∫−±×·…′″≤≥≠≈→∈",
-    *"\N{DOT ABOVE}\N{DIAERESIS}\N{COMBINING DOT ABOVE}\N{COMBINING DIAERESIS}",
+    *"\N{DOT ABOVE}\N{DIAERESIS}\N{MACRON}\N{COMBINING DOT ABOVE}\N{COMBINING DIAERESIS}",
 )
 
 

@@ -102,7 +102,7 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Add stills to moving pictures (docs/assets/docs.js adds a button), and write minus signs.
+    """Add stills to moving pictures (docs/assets/docs.js adds a button), and write formulas and minus signs.
 
     Other pictures become links to their files, because on small screens they are too small to read.
     """
@@ -115,8 +115,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
         r'srcset="\1-still.webp">\g<0></picture></span>',
         html,
     )
-    html = with_minus(with_lazy_pictures(html))
-    return with_indices(html) if page.meta["formulas"] else html
+    return with_minus(with_formulas(with_lazy_pictures(html)))
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -124,7 +123,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     from lag_envs.scenes import SCENES
     from tools.docs.equations import formula_mathml
 
-    markdown, page.meta["formulas"] = re.subn(
+    markdown = re.sub(
         r"^\$\$\n(.+?)\n\$\$$", lambda found: formula_mathml(found[1]), markdown, flags=re.MULTILINE
     )
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))
@@ -170,23 +169,19 @@ def with_minus(html: str) -> str:
     return _changed(html, lambda text: re.sub(r"(?<![\w.-])-(?=[\d∞])", "−", text))
 
 
-def with_indices(html: str) -> str:
-    """Return HTML with the indices and exponents of formulas in the text set as such.
+def with_formulas(html: str) -> str:
+    """Return HTML with the formulas in its text, LaTeX between dollar signs, as MathML.
 
     Examples
     --------
-    >>> with_indices("<p>v_{k+1} and e^-x <code>x_1</code></p>")
-    '<p>v<sub>k+1</sub> and e<sup>−x</sup> <code>x_1</code></p>'
+    >>> with_formulas("<p>so $x = 1$, <code>$x = 1$</code></p>").count("<math")
+    1
     """
+    from tools.docs.equations import formula_mathml
 
-    def element(name: str) -> Callable[[re.Match], str]:
-        return lambda found: f"<{name}>{found[1].strip('{}').replace('-', '−')}</{name}>"
-
-    def change(text: str) -> str:
-        text = re.sub(r"(?<=(?<![A-Za-z_])[A-Za-zͰ-Ͽ∂])_({[^}]+}|\w+)", element("sub"), text)
-        return re.sub(r"\^({[^}]+}|-?\([^)]+\)|-?[\w¼]+)", element("sup"), text)
-
-    return _changed(html, change)
+    return _changed(
+        html, lambda text: re.sub(r"\$([^$]+)\$", lambda f: formula_mathml(unescape(f[1]), block=False), text)
+    )
 
 
 def _changed(html: str, change: Callable[[str], str]) -> str:
