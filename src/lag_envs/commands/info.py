@@ -43,7 +43,8 @@ def _line(id: str) -> tuple[str, ...]:
 
 def _range(acting: Any) -> str:
     """Return a control's name, its range or choices, and its unit."""
-    given = " or ".join(f"{value:g}" for value in acting.values) or f"{acting.low:g} to {acting.high:g}"
+    *others, last = (f"{value:g}" for value in acting.values or (acting.low, acting.high))
+    given = f"{', '.join(others)} {'or' if acting.values else 'to'} {last}"
     return f"{acting.control} {given} {acting.unit}".rstrip()
 
 
