@@ -1,6 +1,7 @@
 """The documentation's site: it builds, makes no request to other hosts, and has no broken links."""
 
 import os
+import posixpath
 import re
 from html import escape, unescape
 from html.parser import HTMLParser
@@ -132,14 +133,39 @@ def test_lists_of_pages(site):
     assert "To the home page</a>" in (site / "404.html").read_text("utf-8")
 
 
+def links_in(text, name, start, end):
+    """Return (title, target) of the links in a part of a page; targets are paths in the site."""
+    part = text.partition(start)[2].partition(end)[0]
+    found = re.findall(r'<a href="([^"]*)"[^>]*>\s*(?:<span[^>]*>\s*)?([^<]*?)\s*<', part)
+    return [(title, posixpath.normpath(posixpath.join(posixpath.dirname(name), at))) for at, title in found]
+
+
 @pytest.mark.slow
-def test_one_navigation(pages):
-    """From each page to every section, and from the board back."""
-    sections = [next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]]
-    assert "board/index.html" in pages["index.html"].links
-    back = [link for link in pages["board/index.html"].links if link.startswith("../")]
-    assert len([link for link in back if "/../" not in link]) == len(sections)
-    assert "../environments/../leaderboard.html" in back  # how to submit
+def test_one_navigation(site, pages):
+    """The same links in the same order in the heads of all pages, and in the menu of narrow screens."""
+    tabs = ("md-tabs__list", "</ul>")
+    sections = links_in((site / "index.html").read_text("utf-8"), "index.html", *tabs)
+    assert [title for title, _ in sections] == [
+        next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]
+    ]
+    assert ("Leaderboard", "board/index.html") in sections
+    env_id = next(iter(TASKS))
+    for name in ("accuracy.html", f"environments/{env_id}.html"):
+        assert links_in((site / name).read_text("utf-8"), name, *tabs) == sections
+    guides = links_in((site / "drive.html").read_text("utf-8"), "drive.html", "<body", "</body>")
+    agent = next(name for name in pages if name.startswith(f"board/{env_id}-"))
+    for name in ("board/index.html", f"board/{env_id}.html", agent):
+        text = (site / name).read_text("utf-8")
+        for where in ("wide", "narrow"):
+            (place,) = re.findall(f'class="site {where}".*?</ul>', text, re.DOTALL)
+            assert links_in(place, name, "<ul>", "</ul>") == sections
+            assert re.findall(r'href="([^"]*)" aria-current', place) == ["index.html"], (
+                "the section is marked"
+            )
+            own = links_in(text, name, f'class="leaderboard {where}"', "</ul>")
+            assert [link for link in dict.fromkeys(guides) if link in own] == own
+            assert own[0] == ("Board", "board/index.html") and len(own) == 5
+    assert "../environments/../leaderboard.html" in pages["board/index.html"].links  # how to submit
 
 
 def text_of(name):
@@ -240,6 +266,41 @@ def test_in_a_browser(site, browser):
     page.get_by_role("textbox", name="Search").fill("truncation bound")
     page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
     assert not asked
+
+
+@pytest.mark.slow
+def test_documentation_and_board_share_their_head(site, browser):
+    """Its parts have the same places, colours and letters, and the choice of light or dark is one."""
+    parts = [
+        (".md-header .md-ellipsis", ".brand b"),
+        (".md-header .md-logo img", ".brand img"),
+        (".md-header__option label:not([hidden]) svg", ".scheme svg"),
+        *((f".md-tabs__item:nth-child({i}) a", f".site.wide li:nth-child({i}) a") for i in (1, 4, 8)),
+    ]
+    looks = """[document.body, document.querySelector('h1')].flatMap((e) => {
+        const look = getComputedStyle(e);
+        return [look.color, look.fontFamily, look.fontWeight];
+    }).concat(getComputedStyle(document.body).backgroundColor)"""
+    left = "(e) => e.getBoundingClientRect().left + parseFloat(getComputedStyle(e).paddingLeft)"
+    page = browser.new_page()
+    for width in (1280, 1920):
+        page.set_viewport_size({"width": width, "height": 900})
+        seen, places = [], []
+        for name, selectors in zip(("accuracy", "board/index"), zip(*parts, strict=True), strict=True):
+            page.goto(f"{site.as_uri()}/{name}.html")
+            seen.append(page.evaluate(looks))
+            places.append([page.locator(selector).first.evaluate(left) for selector in selectors])
+        assert seen[0] == seen[1]
+        assert places[0] == pytest.approx(places[1], abs=1.0)
+    for name, button in (("board/index", ".scheme"), ("index", "label[title=Light]")):
+        page.goto(f"{site.as_uri()}/{name}.html")
+        page.click(button)
+        schemes = []
+        for there in ("index", "board/index"):
+            page.goto(f"{site.as_uri()}/{there}.html")
+            schemes.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+        assert len(set(schemes)) == 1 and (schemes[0] != seen[0][-1]) == (name == "board/index")
+    page.close()
 
 
 #: Words of code in tables that are broken in two.

@@ -1,4 +1,4 @@
-// What scrolls can be scrolled by keyboard: tables that are wider than the page, and formulas.
+// What scrolls can be scrolled by keyboard: tables and figures that are wider than the page, and formulas.
 document$.subscribe(() => {
   const scrolled = new ResizeObserver((entries) => {
     for (const { target } of entries) {
@@ -7,7 +7,7 @@ document$.subscribe(() => {
     }
   });
   requestAnimationFrame(() => {
-    for (const one of document.querySelectorAll(".md-typeset__scrollwrap, .equation")) scrolled.observe(one);
+    for (const one of document.querySelectorAll(".md-typeset__scrollwrap, .equation, .figure")) scrolled.observe(one);
   });
 });
 
