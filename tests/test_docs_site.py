@@ -334,6 +334,29 @@ def test_code_and_formulas_are_readable(site, browser):
 
 
 @pytest.mark.slow
+def test_figures_suit_narrow_screens_and_the_dark(site, browser):
+    """A wide figure scrolls in a box with the focus; in the dark none is white, and maps keep their colours."""
+    page = browser.new_page(viewport={"width": 320, "height": 700}, color_scheme="dark")
+    page.goto(f"{site.as_uri()}/accuracy.html")
+    figure = page.locator(".figure").first
+    until(page, "document.querySelector('.figure').tabIndex", lambda stop: stop == 0)
+    assert figure.locator("img").bounding_box()["width"] > 600
+    assert page.evaluate("document.documentElement.scrollWidth") == 320
+    figure.focus()
+    page.keyboard.press("ArrowRight")
+    until(page, "document.querySelector('.figure').scrollLeft > 0")
+    look = "(image) => [getComputedStyle(image).filter, getComputedStyle(image).mixBlendMode]"
+    assert figure.locator("img").evaluate(look) == ["invert(1) hue-rotate(180deg)", "screen"]
+    for name in ("stability-damping", "extreme-cases-map"):
+        assert page.locator(f"img[src*='{name}']").first.evaluate(look) == ["brightness(0.8)", "normal"]
+    page.goto(f"{site.as_uri()}/index.html")
+    assert page.locator(".moving img").evaluate(look)[1] == "screen"
+    page.emulate_media(media="print")
+    assert page.locator(".moving img").evaluate(look) == ["none", "normal"]
+    page.close()
+
+
+@pytest.mark.slow
 def test_pictures_can_stand_still(site, browser):
     for motion in ("reduce", "no-preference"):
         page = browser.new_page(reduced_motion=motion)

@@ -118,9 +118,9 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Add stills to moving pictures (docs/assets/docs.js adds a button), and write minus signs.
+    """Add stills to moving pictures, to which docs/assets/docs.js adds a button, and write minus signs.
 
-    Other pictures become links to their files, where they can be enlarged.
+    Short cells of tables are kept on a line. Other pictures become links to their files, where they can be enlarged.
     """
     html = re.sub(
         rf'<p>(<img [^>]*src="((?:(?!{MOVING})[^"])+)"[^>]*>)</p>',
@@ -133,6 +133,8 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
         r'srcset="\1-still.webp">\g<0></picture></span>',
         html,
     )
+    # Numbers such as 1e-16 are not broken at their hyphens.
+    html = re.sub(r"<td>(?=[^<]{1,10}</td>)", '<td class="short">', html)
     html = with_minus(with_lazy_pictures(html))
     return with_indices(html) if page.meta["formulas"] else html
 
