@@ -335,7 +335,7 @@ def test_code_and_formulas_are_readable(site, browser):
 
 @pytest.mark.slow
 def test_figures_suit_narrow_screens_and_the_dark(site, browser):
-    """A wide figure scrolls in a box with the focus; in the dark none is white, and maps keep their colours."""
+    """A wide figure scrolls by keyboard; in the dark none is white, and maps keep their colours."""
     page = browser.new_page(viewport={"width": 320, "height": 700}, color_scheme="dark")
     page.goto(f"{site.as_uri()}/accuracy.html")
     figure = page.locator(".figure").first

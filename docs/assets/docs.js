@@ -31,3 +31,22 @@ document$.subscribe(() => {
     picture.after(button);
   }
 });
+
+// On narrow screens the menu opens and closes by keyboard too; the theme has it for pointers only.
+document$.subscribe(() => {
+  const [button, toggle] = [document.querySelector("label.md-header__button[for=__drawer]"), document.getElementById("__drawer")];
+  const say = () => button.setAttribute("aria-expanded", String(toggle.checked));
+  Object.assign(button, { tabIndex: 0, role: "button", ariaLabel: "Menu" });
+  toggle.addEventListener("change", say);
+  say();
+  button.addEventListener("keydown", (event) => {
+    if (event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault();
+    toggle.click();
+  });
+  document.addEventListener("keydown", ({ key }) => {
+    if (key !== "Escape" || !toggle.checked) return;
+    toggle.click();
+    button.focus();
+  });
+});

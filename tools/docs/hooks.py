@@ -120,7 +120,8 @@ def stills() -> dict[str, str | bytes]:
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Add stills to moving pictures, to which docs/assets/docs.js adds a button, and write minus signs.
 
-    Short cells of tables are kept on a line. Other pictures become links to their files, where they can be enlarged.
+    Short cells of tables are kept on a line. Other pictures become links to their files, which can be
+    enlarged.
     """
     html = re.sub(
         rf'<p>(<img [^>]*src="((?:(?!{MOVING})[^"])+)"[^>]*>)</p>',
