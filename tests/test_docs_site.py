@@ -357,6 +357,45 @@ def test_figures_suit_narrow_screens_and_the_dark(site, browser):
 
 
 @pytest.mark.slow
+def test_menu_of_narrow_screens_by_keyboard(site, browser):
+    """It opens and closes, and while it is open or closed, the focus only goes to what is in sight."""
+    page = browser.new_page(viewport={"width": 320, "height": 700}, reduced_motion="reduce")
+    page.goto(f"{site.as_uri()}/accuracy.html")
+    name = "document.activeElement.ariaLabel || document.activeElement.innerText.trim()"
+    seen = """(e => {
+        const { left, top, width, height } = e.getBoundingClientRect();
+        const there = document.elementFromPoint(left + width / 2, top + height / 2);
+        return e.contains(there) || there?.contains(e);
+    })(document.activeElement)"""
+
+    def stops(count):
+        found = []
+        for _ in range(count):
+            page.keyboard.press("Tab")
+            page.wait_for_timeout(300)  # what is in sight only while it has the focus moves in
+            tag = page.evaluate("document.activeElement.tagName")
+            assert tag in ("INPUT", "DIV") or page.evaluate(seen), page.evaluate(name)
+            found.append(page.evaluate(name))
+        return found
+
+    is_open = "document.getElementById('__drawer').checked"
+    assert stops(2) == ["Skip to content", "Menu"]
+    stops(4)
+    page.reload()
+    stops(2)
+    page.keyboard.press("Enter")
+    until(page, is_open)
+    found = stops(7)
+    assert {"Accuracy", "Accuracy in detail", "Speed"} <= set(found) and "Numerics" not in found
+    page.keyboard.press("Escape")
+    until(page, f"!{is_open}")
+    assert page.evaluate(name) == "Menu"
+    page.keyboard.press("Space")
+    until(page, is_open)
+    page.close()
+
+
+@pytest.mark.slow
 def test_pictures_can_stand_still(site, browser):
     for motion in ("reduce", "no-preference"):
         page = browser.new_page(reduced_motion=motion)

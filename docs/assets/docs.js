@@ -32,15 +32,21 @@ document$.subscribe(() => {
   }
 });
 
-// On narrow screens the menu opens and closes by keyboard too; the theme has it for pointers only.
+// On narrow screens the menu opens, changes its level and closes by keyboard too. The theme has Enter, for all labels
+// that have the focus, but they cannot get it.
 document$.subscribe(() => {
   const [button, toggle] = [document.querySelector("label.md-header__button[for=__drawer]"), document.getElementById("__drawer")];
+  const labels = [button, ...document.querySelectorAll(".md-nav--primary :is(.md-nav__title, [for=__toc])")];
+  const narrow = matchMedia("(max-width: 76.2344em)");
+  const reach = () => labels.forEach((label) => (label.tabIndex = narrow.matches ? 0 : -1));
   const say = () => button.setAttribute("aria-expanded", String(toggle.checked));
-  Object.assign(button, { tabIndex: 0, role: "button", ariaLabel: "Menu" });
+  Object.assign(button, { role: "button", ariaLabel: "Menu" });
+  narrow.addEventListener("change", reach);
   toggle.addEventListener("change", say);
+  reach();
   say();
   button.addEventListener("keydown", (event) => {
-    if (event.key !== "Enter" && event.key !== " ") return;
+    if (event.key !== " ") return;
     event.preventDefault();
     toggle.click();
   });
