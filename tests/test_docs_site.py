@@ -83,6 +83,7 @@ def test_every_page_is_there(site, pages):
     assert all(f'id="{kind.__name__.lower()}"' in scenes and "<math" in scenes for kind in SCENES)
     # Most public objects have a docstring, and these are in the reference.
     reference = (site / "api" / "tasks.html").read_text("utf-8")
+    assert not any("::</p>" in path.read_text("utf-8") for path in site.glob("api/*.html"))
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
 
 
@@ -228,6 +229,7 @@ def test_formulas_are_whole(site):
         assert wide and "$$" not in text, name
         found += [*alone, *(part for one in wide for part in re.findall(r"<math.*?</math>", one, re.DOTALL))]
     assert len(found) > 3 * len(TASKS)
+    assert r"\\frac" not in (site / "search" / "search_index.json").read_text("utf-8"), "LaTeX is not found"
     shown = re.sub("<annotation.*?</annotation>|<[^>]*>", "", unescape("".join(found)))
     assert {x for x in shown if not x.isspace()} <= {*CHARACTERS}
     for formula in map(ElementTree.fromstring, found):

@@ -136,6 +136,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     )
     # Numbers such as 1e-16 are not broken at their hyphens.
     html = re.sub(r"<td>(?=[^<]{1,10}</td>)", '<td class="short">', html)
+    html = html.replace("::</p>", ":</p>")  # docstrings announce code by two colons
     html = with_minus(with_lazy_pictures(html))
     return with_indices(html) if page.meta["formulas"] else html
 
