@@ -161,4 +161,4 @@ def clean(text):
 if __name__ == "__main__":
     from lag_envs.leaderboard.site.build import write_page
 
-    write_page(data(tuple(TASKS)), Path(sys.argv[1]))
+    write_page(data(), Path(sys.argv[1]))

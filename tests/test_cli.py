@@ -64,6 +64,13 @@ def test_every_help_has_examples_of_its_own_command():
         assert re.search(rf"^\s+.*{words}\b", examples, re.M), words
 
 
+def test_lines_of_help_fit_a_terminal(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    for words, parser in parsers(cli.parser(), "lag-envs"):
+        text = parser.format_help().partition("\nexamples:\n")[0]  # commands are to be copied whole
+        assert max(map(len, text.splitlines())) <= 100, words
+
+
 def test_examples_parse():
     """Each line of an example is one that the command accepts."""
     whole, count = cli.parser(), 0

@@ -1,6 +1,7 @@
 """The documentation's site: it builds, makes no request to other hosts, and has no broken links."""
 
 import os
+import posixpath
 import re
 from html import escape, unescape
 from html.parser import HTMLParser
@@ -82,6 +83,7 @@ def test_every_page_is_there(site, pages):
     assert all(f'id="{kind.__name__.lower()}"' in scenes and "<math" in scenes for kind in SCENES)
     # Most public objects have a docstring, and these are in the reference.
     reference = (site / "api" / "tasks.html").read_text("utf-8")
+    assert not any("::</p>" in path.read_text("utf-8") for path in site.glob("api/*.html"))
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
 
 
@@ -132,14 +134,39 @@ def test_lists_of_pages(site):
     assert "To the home page</a>" in (site / "404.html").read_text("utf-8")
 
 
+def links_in(text, name, start, end):
+    """Return (title, target) of the links in a part of a page; targets are paths in the site."""
+    part = text.partition(start)[2].partition(end)[0]
+    found = re.findall(r'<a href="([^"]*)"[^>]*>\s*(?:<span[^>]*>\s*)?([^<]*?)\s*<', part)
+    return [(title, posixpath.normpath(posixpath.join(posixpath.dirname(name), at))) for at, title in found]
+
+
 @pytest.mark.slow
-def test_one_navigation(pages):
-    """From each page to every section, and from the board back."""
-    sections = [next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]]
-    assert "board/index.html" in pages["index.html"].links
-    back = [link for link in pages["board/index.html"].links if link.startswith("../")]
-    assert len([link for link in back if "/../" not in link]) == len(sections)
-    assert "../environments/../leaderboard.html" in back  # how to submit
+def test_one_navigation(site, pages):
+    """The same links in the same order in the heads of all pages, and in the menu of narrow screens."""
+    tabs = ("md-tabs__list", "</ul>")
+    sections = links_in((site / "index.html").read_text("utf-8"), "index.html", *tabs)
+    assert [title for title, _ in sections] == [
+        next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]
+    ]
+    assert ("Leaderboard", "board/index.html") in sections
+    env_id = next(iter(TASKS))
+    for name in ("accuracy.html", f"environments/{env_id}.html"):
+        assert links_in((site / name).read_text("utf-8"), name, *tabs) == sections
+    guides = links_in((site / "drive.html").read_text("utf-8"), "drive.html", "<body", "</body>")
+    agent = next(name for name in pages if name.startswith(f"board/{env_id}-"))
+    for name in ("board/index.html", f"board/{env_id}.html", agent):
+        text = (site / name).read_text("utf-8")
+        for where in ("wide", "narrow"):
+            (place,) = re.findall(f'class="site {where}".*?</ul>', text, re.DOTALL)
+            assert links_in(place, name, "<ul>", "</ul>") == sections
+            assert re.findall(r'href="([^"]*)" aria-current', place) == ["index.html"], (
+                "the section is marked"
+            )
+            own = links_in(text, name, f'class="leaderboard {where}"', "</ul>")
+            assert [link for link in dict.fromkeys(guides) if link in own] == own
+            assert own[0] == ("Board", "board/index.html") and len(own) == 5
+    assert "../environments/../leaderboard.html" in pages["board/index.html"].links  # how to submit
 
 
 def text_of(name):
@@ -202,6 +229,7 @@ def test_formulas_are_whole(site):
         assert wide and "$$" not in text, name
         found += [*alone, *(part for one in wide for part in re.findall(r"<math.*?</math>", one, re.DOTALL))]
     assert len(found) > 3 * len(TASKS)
+    assert r"\\frac" not in (site / "search" / "search_index.json").read_text("utf-8"), "LaTeX is not found"
     shown = unescape(re.sub("<annotation.*?</annotation>|<[^>]*>", "", "".join(found)))
     assert {x for x in shown if not x.isspace()} <= {*CHARACTERS}
     for formula in map(ElementTree.fromstring, found):
@@ -243,6 +271,41 @@ def test_in_a_browser(site, browser):
     assert not asked
 
 
+@pytest.mark.slow
+def test_documentation_and_board_share_their_head(site, browser):
+    """Its parts have the same places, colours and letters, and the choice of light or dark is one."""
+    parts = [
+        (".md-header .md-ellipsis", ".brand b"),
+        (".md-header .md-logo img", ".brand img"),
+        (".md-header__option label:not([hidden]) svg", ".scheme svg"),
+        *((f".md-tabs__item:nth-child({i}) a", f".site.wide li:nth-child({i}) a") for i in (1, 4, 8)),
+    ]
+    looks = """[document.body, document.querySelector('h1')].flatMap((e) => {
+        const look = getComputedStyle(e);
+        return [look.color, look.fontFamily, look.fontWeight];
+    }).concat(getComputedStyle(document.body).backgroundColor)"""
+    left = "(e) => e.getBoundingClientRect().left + parseFloat(getComputedStyle(e).paddingLeft)"
+    page = browser.new_page()
+    for width in (1280, 1920):
+        page.set_viewport_size({"width": width, "height": 900})
+        seen, places = [], []
+        for name, selectors in zip(("accuracy", "board/index"), zip(*parts, strict=True), strict=True):
+            page.goto(f"{site.as_uri()}/{name}.html")
+            seen.append(page.evaluate(looks))
+            places.append([page.locator(selector).first.evaluate(left) for selector in selectors])
+        assert seen[0] == seen[1]
+        assert places[0] == pytest.approx(places[1], abs=1.0)
+    for name, button in (("board/index", ".scheme"), ("index", "label[title=Light]")):
+        page.goto(f"{site.as_uri()}/{name}.html")
+        page.click(button)
+        schemes = []
+        for there in ("index", "board/index"):
+            page.goto(f"{site.as_uri()}/{there}.html")
+            schemes.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+        assert len(set(schemes)) == 1 and (schemes[0] != seen[0][-1]) == (name == "board/index")
+    page.close()
+
+
 #: Words of code in tables that are broken in two.
 BROKEN = r"""[...document.querySelectorAll('td code')].flatMap(({ firstChild: text }) => {
     if (text?.nodeType !== 3) return [];
@@ -270,6 +333,68 @@ def test_code_and_formulas_are_readable(site, browser):
             "[...document.querySelectorAll('.equation')].map((e) => e.scrollWidth / e.clientWidth)"
         )
         assert max(widths, default=0.0) < 1.2, name
+    page.close()
+
+
+@pytest.mark.slow
+def test_figures_suit_narrow_screens_and_the_dark(site, browser):
+    """A wide figure scrolls by keyboard; in the dark none is white, and maps keep their colours."""
+    page = browser.new_page(viewport={"width": 320, "height": 700}, color_scheme="dark")
+    page.goto(f"{site.as_uri()}/accuracy.html")
+    figure = page.locator(".figure").first
+    until(page, "document.querySelector('.figure').tabIndex", lambda stop: stop == 0)
+    assert figure.locator("img").bounding_box()["width"] > 600
+    assert page.evaluate("document.documentElement.scrollWidth") == 320
+    figure.focus()
+    page.keyboard.press("ArrowRight")
+    until(page, "document.querySelector('.figure').scrollLeft > 0")
+    look = "(image) => [getComputedStyle(image).filter, getComputedStyle(image).mixBlendMode]"
+    assert figure.locator("img").evaluate(look) == ["invert(1) hue-rotate(180deg)", "screen"]
+    for name in ("stability-damping", "extreme-cases-map"):
+        assert page.locator(f"img[src*='{name}']").first.evaluate(look) == ["brightness(0.8)", "normal"]
+    page.goto(f"{site.as_uri()}/index.html")
+    assert page.locator(".moving img").evaluate(look)[1] == "screen"
+    page.emulate_media(media="print")
+    assert page.locator(".moving img").evaluate(look) == ["none", "normal"]
+    page.close()
+
+
+@pytest.mark.slow
+def test_menu_of_narrow_screens_by_keyboard(site, browser):
+    """It opens and closes, and while it is open or closed, the focus only goes to what is in sight."""
+    page = browser.new_page(viewport={"width": 320, "height": 700}, reduced_motion="reduce")
+    page.goto(f"{site.as_uri()}/accuracy.html")
+    name = "document.activeElement.ariaLabel || document.activeElement.innerText.trim()"
+    seen = """(e => {
+        const { left, top, width, height } = e.getBoundingClientRect();
+        const there = document.elementFromPoint(left + width / 2, top + height / 2);
+        return e.contains(there) || there?.contains(e);
+    })(document.activeElement)"""
+
+    def stops(count):
+        found = []
+        for _ in range(count):
+            page.keyboard.press("Tab")
+            page.wait_for_timeout(300)  # what is in sight only while it has the focus moves in
+            tag = page.evaluate("document.activeElement.tagName")
+            assert tag in ("INPUT", "DIV") or page.evaluate(seen), page.evaluate(name)
+            found.append(page.evaluate(name))
+        return found
+
+    is_open = "document.getElementById('__drawer').checked"
+    assert stops(2) == ["Skip to content", "Menu"]
+    stops(4)
+    page.reload()
+    stops(2)
+    page.keyboard.press("Enter")
+    until(page, is_open)
+    found = stops(7)
+    assert {"Accuracy", "Accuracy in detail", "Speed"} <= set(found) and "Numerics" not in found
+    page.keyboard.press("Escape")
+    until(page, f"!{is_open}")
+    assert page.evaluate(name) == "Menu"
+    page.keyboard.press("Space")
+    until(page, is_open)
     page.close()
 
 

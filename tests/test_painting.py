@@ -110,7 +110,7 @@ def test_png_can_be_read(tmp_path):
 def test_colours_and_widths_are_those_of_the_page():
     """`site.js` paints the same shapes in a browser; its style sheet has the colours of light and dark."""
     site = Path(painting.__file__).parents[1] / "leaderboard" / "site" / "static"
-    css = (site / "site.css").read_text(encoding="utf-8")
+    css = (site / "look.css").read_text(encoding="utf-8")
     colour = dict(re.findall(r"--([\w-]+): var\(--light, (#[0-9a-f]{6})\)", css))
     roles = re.search(r"ink\.roles = \{(.*?)\n    \};", (site / "site.js").read_text(encoding="utf-8"), re.S)
     found = {}
@@ -134,7 +134,7 @@ def page(browser):
     assert count == 1
     page = browser.new_page(viewport={"width": 700, "height": 500})
     page.set_content(
-        f"<style>{(site / 'site.css').read_text(encoding='utf-8')}</style>"
+        f"<style>{(site / 'look.css').read_text(encoding='utf-8')}</style>"
         "<canvas width=600 height=400></canvas>"
     )
     page.evaluate("text => { try { (0, eval)(text); } catch { /* there is no board */ } }", script)

@@ -242,12 +242,14 @@ def test_compact_form(written, tmp_path, monkeypatch):
     )
     monkeypatch.setattr(docs.overview, "draw_overview", lambda _: Figure())
     monkeypatch.setattr(docs.overview, "overview_sentences", lambda _: ["Nobody is faster."])
+    monkeypatch.setattr(docs.overview, "faster_rivals", lambda _: [("1e-06", "2 of 7", "5e+13")])
     assert docs.main([str(written), str(tmp_path)]) == 0
     text = (tmp_path / "docs" / "accuracy-details.md").read_text(encoding="utf-8")
     assert "| There are five. | **holds** | 5 found |" in text
     assert "![A line](images/accuracy/dummy.svg)" in text
     page = (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8")
     assert page.index("overview.png") < page.index("- Nobody is faster.") < page.index("## Dummies")
+    assert "| 1e-6 | 2 of 7 | 5e13 |" in page, "exponents are written as people do"
     assert "images/accuracy/dots.png" in page and "dummy.svg" not in page
     assert "lag-envs report --sections tests.dummy" in page and "1 of 2 claims hold" in page
     for name in ("dots.png", "overview.png"):

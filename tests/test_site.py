@@ -321,7 +321,7 @@ def luminance(colour):
 
 @pytest.mark.parametrize("theme", [0, 1], ids=["light", "dark"])
 def test_contrast(theme):
-    text = (site.STATIC / "site.css").read_text("utf-8")
+    text = (site.STATIC / "look.css").read_text("utf-8")
     found = re.findall(r"--([\w-]+): var\(--light, (#\w{6})\) var\(--dark, (#\w{6})\);", text)
     colours = {name: both[theme] for name, *both in found}
 

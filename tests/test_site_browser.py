@@ -484,7 +484,7 @@ def test_environments_are_listed_in_a_menu(open_page, data, documented):
     is_open, summary = "document.querySelector('.menu').open", page.locator(".menu summary")
     summary.focus()
     page.keyboard.press("Enter")
-    listed = page.locator(".menu > ul > li").all_inner_texts()
+    listed = page.locator(".menu .scenes > li").all_inner_texts()
     groups = {type(TASKS[b["id"]]().scene).__name__: b["id"] for b in data["environments"]}
     assert [text.split() for text in listed] == [[scene, env_id] for scene, env_id in sorted(groups.items())]
     assert page.locator(".menu [aria-current=page]").inner_text() == own
@@ -507,8 +507,11 @@ def test_environments_are_listed_in_a_menu(open_page, data, documented):
             assert before < 200
             page.tap(".menu summary")
             assert page.evaluate(f"{is_open} && document.documentElement.scrollWidth") == width
-            box = page.locator(".menu > ul").bounding_box()
+            box = page.locator(".menu .sheet").bounding_box()
             assert page.evaluate(top) == before and box["y"] + box["height"] <= 640
+            # The site's links are in the head or, where they would be cut off, in the menu.
+            home = page.locator("a:text-is('Home')").all()
+            assert [link.is_visible() for link in home] == [width > 1219, width < 1220]
             page.tap(".menu summary")
         page.tap(".menu summary")
         page.tap(f".menu a:text-is('{incline.Brake.id}')")
@@ -560,6 +563,11 @@ def test_the_documentations_choice_of_light_or_dark_is_followed(open_page, docum
     stored = {"origin": documented, "localStorage": [{"name": key, "value": slate}]}
     page = open_page("index", root, color_scheme="light", storage_state={"cookies": [], "origins": [stored]})
     assert looks(page, dark)
+    for wanted in (light, dark):
+        page.click(".scheme")
+        assert looks(page, wanted), "its button is the documentation's"
+        scheme = json.loads(page.evaluate("key => localStorage[key]", key))["color"]["scheme"]
+        assert scheme == ("default" if wanted is light else "slate")
     early = "(e => !e.defer && !e.async && e.src.includes('/scheme-'))(document.querySelector('head script'))"
     assert page.evaluate(early), "it decides before the first paint"
     page.add_init_script("Object.defineProperty(window, 'localStorage', { get() { throw Error(); } })")

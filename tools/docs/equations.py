@@ -129,7 +129,8 @@ def formula_mathml(latex: str, block: bool = True) -> str:
     """Return a formula as MathML that includes its LaTeX; the lines of a block formula end before + and -."""
     parts = split_terms(latex) if block else [latex]
     bodies = [_body(part) for part in parts]
-    source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
+    hidden = 'data-search-exclude="" encoding="application/x-tex"'
+    source = f"<annotation {hidden}>{escape(latex, quote=False)}</annotation>"
     bodies[0] = f"<semantics><mrow>{bodies[0]}</mrow>{source}</semantics>"
     if not block:
         return f'<math xmlns="http://www.w3.org/1998/Math/MathML">{bodies[0]}</math>'

@@ -25,6 +25,8 @@ ROOT_FILES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.m
 SOURCE = "https://github.com/lag-envs/lag-envs/blob/main/"
 #: Paths of the leaderboard's page and of the environments' pages.
 BOARD, ENVIRONMENTS = "board", "environments"
+#: The section of the board's page, and the guide to submissions, which is part of another section's page.
+SECTION, SUBMIT = "Leaderboard", ("How to submit", "contributing.html#submit-to-the-leaderboard")
 MOVING = "images/moving"
 #: The longest description of a page.
 LONGEST = 200
@@ -64,27 +66,41 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages, and pages from the root."""
+    from lag_envs.leaderboard.site.build import STATIC
     from tools.docs.font import FILE, math_font
 
     texts = generated() | {
         place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_FILES.items()
     }
-    for place, content in (texts | board_pages(config) | stills() | {FILE: math_font()}).items():
+    shared = {f"assets/{name}": (STATIC / name).read_bytes() for name in ("look.css", "logo.svg")}
+    for place, content in (texts | board_pages(config) | stills() | shared | {FILE: math_font()}).items():
         files.append(File.generated(config, place, content=content))
     return files
 
 
 def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
-    """Return the files of the board's page, with the site's sections in its head."""
+    """Return the files of the board's page, whose head has the site's sections and those of its own."""
     from lag_envs.leaderboard.site.build import render
 
-    sections = []
+    sections, section = [], []
     for entry in config.nav or ():
-        ((title, pages),) = entry.items()
-        first = pages[0] if isinstance(pages[0], str) else next(iter(pages[0].values()))
-        address = f"{BOARD}/index.html" if title == "Leaderboard" else first.removesuffix("md") + "html"
-        sections.append((title, f"../{address}"))
-    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections, SOURCE, f"../{ENVIRONMENTS}/")
+        ((title, listed),) = entry.items()
+        links = [next(iter(page.items())) if isinstance(page, dict) else (title, page) for page in listed]
+        if title == SECTION:
+            links = section = [("Board", f"{BOARD}/index.html"), *links, SUBMIT]
+        sections.append((title, links[0][1]))
+
+    def addresses(links: list[tuple[str, str]]) -> list[tuple[str, str]]:
+        return [(title, posixpath.relpath(place.replace(".md", ".html"), BOARD)) for title, place in links]
+
+    pages, files = render(
+        board(),
+        f"{config.site_url}{BOARD}/",
+        addresses(sections),
+        addresses(section),
+        SOURCE,
+        f"../{ENVIRONMENTS}/",
+    )
     return {f"{BOARD}/{name}": content for name, content in (pages | files).items()}
 
 
@@ -102,12 +118,15 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Add stills to moving pictures (docs/assets/docs.js adds a button), and write formulas and minus signs.
+    """Add stills to moving pictures, to which docs/assets/docs.js adds a button; write formulas and minus signs.
 
-    Other pictures become links to their files, because on small screens they are too small to read.
+    Short cells of tables are kept on a line. Other pictures become links to their files, which can be
+    enlarged.
     """
     html = re.sub(
-        rf'<p>(<img [^>]*src="((?:(?!{MOVING})[^"])+)"[^>]*>)</p>', r'<p><a href="\2">\1</a></p>', html
+        rf'<p>(<img [^>]*src="((?:(?!{MOVING})[^"])+)"[^>]*>)</p>',
+        r'<p class="figure"><a href="\2">\1</a></p>',
+        html,
     )
     html = re.sub(
         rf'<img [^>]*src="([^"]*{MOVING}/[^"]+)\.webp"[^>]*>',
@@ -115,6 +134,9 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
         r'srcset="\1-still.webp">\g<0></picture></span>',
         html,
     )
+    # Numbers such as 1e-16 are not broken at their hyphens.
+    html = re.sub(r"<td>(?=[^<]{1,10}</td>)", '<td class="short">', html)
+    html = html.replace("::</p>", ":</p>")  # docstrings announce code by two colons
     return with_minus(with_formulas(with_lazy_pictures(html)))
 
 
@@ -214,9 +236,9 @@ def description(page: Page, markdown: str) -> str:
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
     """Add the board, which is built separately from the pages, and the guide to it."""
     for section in nav.items:
-        if section.title == "Leaderboard" and section.children is not None:
+        if section.title == SECTION and section.children is not None:
             section.children.insert(0, Link("Board", f"{BOARD}/index.html"))
-            section.children.append(Link("How to submit", "contributing.html#submit-to-the-leaderboard"))
+            section.children.append(Link(*SUBMIT))
     return nav
 
 

@@ -232,9 +232,9 @@ BENCH = Command(
     "bench",
     "compare the speed with other libraries",
     """Compare steps per second with Gymnasium and, if installed, EnvPool, gymnax and TorchRL, in one
-run on one core: each round takes a sample of every row, and ratios are taken within a round. Then time
-the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so far; a second
-Ctrl-C ends it at once, without results.
+run on one core: each round takes a sample of every row, and ratios are taken within a round.
+Then time the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so
+far; a second Ctrl-C ends it at once, without results.
 
 examples:
   lag-envs bench --quick                             one environment, in under a minute

@@ -59,8 +59,8 @@ REPLAY = Command(
     "replay",
     "recompute a drive from its link",
     """Recompute a drive, given as a link from the leaderboard's page, from its seed and keys, with
-arithmetic that has the same bits on every machine, and check whether the link claims the right return.
-The exit status is 0 if it does, 1 if it does not, 2 for a damaged link.
+arithmetic that has the same bits on every machine, and check whether the link claims the right
+return. The exit status is 0 if it does, 1 if it does not, 2 for a damaged link.
 
 examples:
   lag-envs replay 'https://example.org/board/PivotedBar-v0.html#drive=1~...'
@@ -72,14 +72,15 @@ LEADERBOARD = Command(
     "leaderboard",
     "keep the leaderboard",
     """Keep a leaderboard: add submissions, recompute their scores, show and publish the ranking. A
-submission is verified with a nonce that is published after the submission was added: `add` adds it, `nonce`
-publishes a nonce and verifies all that wait for one. After Ctrl-C or a kill, `add` without a folder resumes.
+submission is verified with a nonce that is published after the submission was added: `add` adds
+it, `nonce` publishes a nonce and verifies all that wait for one. After Ctrl-C or a kill, `add`
+without a folder resumes.
 
 examples:
   lag-envs leaderboard add my-submission             add it; it waits for the next nonce
   lag-envs leaderboard nonce 5f3c...                 publish a nonce, and verify what waits for it
   lag-envs leaderboard add mine/* --nonce test-1     both at once, for a board of your own
-  lag-envs leaderboard list PivotedBar-v0            the ranking, and the state of all other submissions
+  lag-envs leaderboard list PivotedBar-v0            the ranking, and the state of all others
   lag-envs leaderboard serve                         the page, at http://127.0.0.1:8000
   lag-envs leaderboard add --help                    more about one action""",
     _leaderboard("cli", "declare_leaderboard"),

@@ -152,17 +152,17 @@ examples:
 WATCH = Command(
     "watch",
     "watch an agent, in a window or as a video",
-    """Watch an agent drive an environment, in a window, or write a video. By default, the agent is the
-policy that comes with the package: the best network or table of the leaderboard, or a smaller one where
-the best is large. Controllers are chosen by name. This needs the extras render and leaderboard; models
-of your own also need agents.
+    """Watch an agent drive an environment, in a window, or write a video. By default, the agent is
+the policy that comes with the package: the best network or table of the leaderboard, or a smaller
+one where the best is large. Controllers are chosen by name. This needs the extras render and
+leaderboard; models of your own also need agents.
 
 examples:
   lag-envs watch PivotedBar-v0
   lag-envs watch PivotedBar-v0 --agent "energy shaping + LQR"
   lag-envs watch PivotedBar-v0 --seed 1 --video episode.mp4
   lag-envs watch PivotedBar-v0 --agent leaderboard/submissions/PivotedBar-v0-ppo-c1dc3900
-  lag-envs watch ball_on_beam.py --agent model.zip     a task and a model of your own; this runs both""",
+  lag-envs watch ball_on_beam.py --agent model.zip   a task and a model of your own; this runs both""",
     declare_watch,
     run_watch,
 )

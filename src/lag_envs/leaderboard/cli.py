@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -57,7 +58,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         one = actions.add_parser(
             name,
             help=help,
-            description=help[0].upper() + help[1:] + ".",
+            description=textwrap.fill(help[0].upper() + help[1:] + ".", 97),
             epilog=examples and "examples:" + examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )

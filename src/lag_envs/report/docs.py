@@ -54,8 +54,10 @@ PARTS = (
         "One step of the package's scenes",
         "Bar, incline and shell have dedicated steps. lag_envs is measured as shipped, at rounding error. "
         "A rival gets the scene's own equation, and is in its fastest form, with the setting that just "
-        "reaches an error. Only lag_envs has a bound before the step. The table names the fastest rival "
-        "for each error, with its time as a multiple of that of lag_envs: below 1 the rival is faster.",
+        "reaches an error; *carried* means that it takes cosine and sine along as unknowns, which is faster "
+        "than to compute them at every stage. Only lag_envs has a bound before the step. The table names the "
+        "fastest rival for each error, with its time as a multiple of that of lag_envs: below 1 the rival is "
+        "faster.",
         (),
     ),
     PagePart(
@@ -221,6 +223,11 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
         *_picture({"file": f"{OVERVIEW.name}.png", "caption": OVERVIEW.caption}),
         "The main results:",
         _bullets([*FIRST, *overview.overview_sentences(accuracy)]),
+        "How often a rival is faster, in comparisons of single states and of batches:",
+        markdown_table(
+            ["error", "on the package's scenes", "on scenes defined by energies alone"],
+            overview.faster_rivals(accuracy),
+        ),
         _command("work_precision,general"),
         "## What is promised",
         INTRODUCTION,
@@ -241,7 +248,7 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
     if broken:
         parts.append(_bullets(f"{claim['text']} ({claim['evidence']})" for claim in broken))
     parts += ["## Machine and versions", *_about(accuracy)]
-    return "\n\n".join(parts) + "\n"
+    return _page(parts)
 
 
 INTRODUCTION = """\
@@ -284,7 +291,12 @@ def details(accuracy: dict[str, Any]) -> str:
             parts += _picture(picture)
         if section["problems"]:
             parts += ["Did not work:", _bullets(section["problems"])]
-    return "\n\n".join(parts) + "\n"
+    return _page(parts)
+
+
+def _page(parts: Iterable[str]) -> str:
+    """Return a page of paragraphs, with exponents as people write them: 1e-6 for 1e-06, 4e13 for 4e+13."""
+    return re.sub(r"(?<=\de)(-?)\+?0?(?=[1-9])", r"\1", "\n\n".join(parts)) + "\n"
 
 
 def _bullets(texts: Iterable[str]) -> str:

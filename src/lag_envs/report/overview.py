@@ -17,6 +17,8 @@ from lag_envs.report.points import LAG_ENVS
 
 #: A scene with a dedicated step, a system for the general series, and the methods that step both.
 SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
+#: The tables of times on systems for the general series, of single states and in batches.
+MODES = ("general-times-single", "general-times-batch")
 #: The names of rivals in the picture.
 RIVALS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
 Points = list[tuple[float, float]]
@@ -63,7 +65,7 @@ def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
     """Return the same results for a system that is stepped by the general series."""
     own_points: Points = []
     rivals: dict[str, Points] = {}
-    for row in _rows(accuracy, "general", "general-times-single", system=SYSTEM):
+    for row in _rows(accuracy, "general", MODES[0], system=SYSTEM):
         own_points.append((row[LAG_ENVS], float(row["error"])))
         for name in RIVALS:
             if row[name] is not None:
@@ -73,30 +75,30 @@ def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
     return own_points, rivals
 
 
-def overview_sentences(accuracy: dict[str, Any]) -> list[str]:
-    """Return sentences about how often a rival is faster, and about the time of a general simulator."""
+def faster_rivals(accuracy: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return for each error how often a rival is faster: on the package's scenes, and on others."""
     own = list(_rows(accuracy, "work_precision", "work_precision_targets", horizon="one step"))
-    modes = ("general-times-single", "general-times-batch")
-    systems = [row for name in modes for row in _rows(accuracy, "general", name)]
-    texts = []
-    for error in dict.fromkeys(float(row["error"]) for row in systems):
-        faster = [
-            sum(row[ratio] is not None and row[ratio] < 1.0 for row in rows if float(row["error"]) == error)
-            for rows, ratio in ((own, "other / lag_envs"), (systems, "quickest other / lag_envs"))
-        ]
-        counts = [sum(float(row["error"]) == error for row in rows) for rows in (own, systems)]
-        texts.append(
-            f"At an error of {_power(error)}, a rival is faster in {faster[0]} of {counts[0]} comparisons "
-            f"on the package's scenes, and in {faster[1]} of {counts[1]} on scenes defined by energies alone "
-            "(single states and batches).",
-        )
-    row = list(_rows(accuracy, "general", modes[0], system=SYSTEM))[-1]
-    if row["MuJoCo"] is not None:
-        texts.append(
-            f"A general simulator pays for its generality: at {_power(row['error'])} MuJoCo takes "
-            f"{row['MuJoCo'] / row[LAG_ENVS]:,.0f} times as long as lag_envs in the right panel."
-        )
-    return texts
+    systems = [row for name in MODES for row in _rows(accuracy, "general", name)]
+
+    def often(rows: list[dict[str, Any]], ratio: str, error: float) -> str:
+        ratios = [row[ratio] for row in rows if float(row["error"]) == error]
+        return f"{sum(x is not None and x < 1.0 for x in ratios)} of {len(ratios)}"
+
+    return [
+        (_power(x), often(own, "other / lag_envs", x), often(systems, "quickest other / lag_envs", x))
+        for x in dict.fromkeys(float(row["error"]) for row in systems)
+    ]
+
+
+def overview_sentences(accuracy: dict[str, Any]) -> list[str]:
+    """Return a sentence about the time of a general simulator, if one was measured."""
+    row = list(_rows(accuracy, "general", MODES[0], system=SYSTEM))[-1]
+    if row["MuJoCo"] is None:
+        return []
+    return [
+        f"A general simulator pays for its generality: at {_power(row['error'])} MuJoCo takes "
+        f"{row['MuJoCo'] / row[LAG_ENVS]:,.0f} times as long as lag_envs in the right panel."
+    ]
 
 
 def _power(error: float | str) -> str:

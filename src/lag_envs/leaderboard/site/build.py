@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -170,19 +170,22 @@ def render(
     data: Mapping[str, Any],
     url: str = "",
     site: Sequence[tuple[str, str]] = (),
+    section: Sequence[tuple[str, str]] = (),
     source: str = "",
     documentation: str = "",
 ) -> tuple[dict[str, str], dict[str, str | bytes]]:
     """Return the pages, the overview last, and the files they refer to: content by path.
 
-    If the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
+    If the page is part of a larger site, `site` has (title, address) of its sections, home first, and
+    `section` those of the pages of the board's own, for the pages' head; the overview is index.html in both.
     `source` is the address of the project's files, to which submissions are linked, `documentation` that of
     the environments' pages, ID.html; both end with a slash.
     """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
     assets, taken = Assets(), {"index"}
-    style = assets.keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
+    look = "\n".join((STATIC / f"{name}.css").read_text("utf-8") for name in ("look", "site"))
+    style = assets.keep("site", "css", look)
     script = assets.keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
     scheme = documentation and assets.keep("scheme", "js", (STATIC / "scheme.js").read_text("utf-8"))
     parts = "\n".join((STATIC / f"{name}.js").read_text("utf-8") for name in ("episode", "drive"))
@@ -200,9 +203,10 @@ def render(
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
         "made": data["made"], "style": style,
+        "logo": f"data:image/svg+xml,{quote((STATIC / 'logo.svg').read_text('utf-8'))}",
         "script": script, "scheme": scheme, "drive": drive, "protocol": data["protocol"],
         "embed": lambda value: Markup(page_json(value)), "url": url and url.rstrip("/") + "/",
-        "site": site, "source": source, "documentation": documentation,
+        "site": site, "section": section, "source": source, "documentation": documentation,
         "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")

@@ -18,6 +18,23 @@
     if (dataset.scheme !== scheme) dataset.scheme = scheme;
   }
 
+  /** Choose the other one, and store it as the theme does: the place of the button's choice, and what it means. */
+  function choose() {
+    const dark = getComputedStyle(document.documentElement).colorScheme === "dark";
+    const scheme = dark ? "default" : "slate";
+    dataset.scheme = scheme;
+    try {
+      localStorage.setItem(key, JSON.stringify({ index: Number(!dark), color: { scheme } }));
+    } catch {
+      // Storage is forbidden or full: the choice is this page's.
+    }
+  }
+
+  document.addEventListener("DOMContentLoaded", () => {
+    const button = document.querySelector(".scheme");
+    button.hidden = false;
+    button.addEventListener("click", choose);
+  });
   follow();
   // The choice may change in another tab, or before the reader comes back.
   addEventListener("storage", follow);

@@ -1286,7 +1286,8 @@
     const away = ({ target }) => {
       if (!menu.contains(target)) menu.open = false;
     };
-    menu.addEventListener("toggle", () => find("[aria-current]", menu)?.scrollIntoView({ block: "nearest" }));
+    const current = () => all("[aria-current]", menu).find((link) => link.offsetParent);
+    menu.addEventListener("toggle", () => current()?.scrollIntoView({ block: "nearest" }));
     document.addEventListener("pointerdown", away);
     document.addEventListener("focusin", away);
     document.addEventListener("keydown", ({ key }) => {
