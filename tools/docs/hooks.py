@@ -118,7 +118,7 @@ def stills() -> dict[str, str | bytes]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Add stills to moving pictures, to which docs/assets/docs.js adds a button; write formulas and minus signs.
+    """Add stills to moving pictures (docs/assets/docs.js adds a button); write formulas and minus signs.
 
     Short cells of tables are kept on a line. Other pictures become links to their files, which can be
     enlarged.
