@@ -80,6 +80,24 @@ def test_torch_func(step):
             forward(lambda s: step(s, actions[0]).rewards)(states[0])
 
 
+def test_environments_refuse_what_would_lose_gradients(step):
+    """Tangents of forward mode, and transforms of torch.func."""
+    envs, (states, actions) = TorchVectorEnv(step.task.id, 2), (x.detach() for x in near(2))
+    envs.reset(seed=0)
+    before = envs.state.clone()
+    with torch.autograd.forward_ad.dual_level():
+        for call, given in [(envs.step, actions), (lambda x: envs.reset(options={"state": x}), states)]:
+            with pytest.raises(NotImplementedError, match="no forward mode .* use jacrev"):
+                call(torch.autograd.forward_ad.make_dual(given, torch.ones_like(given)))
+        envs.reset(options={"state": before})  # without a tangent
+    total = {"grad": lambda a: envs.step(a)[1].sum(), "vmap": lambda a: envs.step(a)[1]}
+    for name, rewards in total.items():
+        with pytest.raises(NotImplementedError, match=r"inside torch\.func .* use lag_envs\.torch\.Step"):
+            getattr(torch.func, name)(rewards)(actions[None] if name == "vmap" else actions)
+    assert torch.equal(envs.state, before)
+    assert torch.isfinite(envs.step(actions)[1]).all()
+
+
 def test_a_step_of_a_class(step):
     found = Step(type(step.task), damping=0.1)
     assert found.task.scene.damping == 0.1 and type(found.task) is type(step.task)
