@@ -80,6 +80,7 @@ def test_torch_func(step):
             forward(lambda s: step(s, actions[0]).rewards)(states[0])
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, for forward_ad
 def test_environments_refuse_what_would_lose_gradients(step):
     """Tangents of forward mode, and transforms of torch.func."""
     envs, (states, actions) = TorchVectorEnv(step.task.id, 2), (x.detach() for x in near(2))
@@ -87,7 +88,7 @@ def test_environments_refuse_what_would_lose_gradients(step):
     before = envs.state.clone()
     with torch.autograd.forward_ad.dual_level():
         for call, given in [(envs.step, actions), (lambda x: envs.reset(options={"state": x}), states)]:
-            with pytest.raises(NotImplementedError, match="no forward mode .* use jacrev"):
+            with pytest.raises(NotImplementedError, match=r"no forward mode .* use jacrev"):
                 call(torch.autograd.forward_ad.make_dual(given, torch.ones_like(given)))
         envs.reset(options={"state": before})  # without a tangent
     total = {"grad": lambda a: envs.step(a)[1].sum(), "vmap": lambda a: envs.step(a)[1]}
