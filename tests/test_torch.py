@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 
 import lag_envs
 from lag_envs.envs.model import Model
-from lag_envs.tasks import TASKS, incline, pivoted_bar
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleExact
 
 torch = pytest.importorskip("torch")
@@ -351,6 +351,18 @@ def test_float32_at_ordinary_states(step, state):
         slopes[kind] = torch.autograd.grad(total, given)
     for narrow, wide in zip(*slopes.values(), strict=True):
         torch.testing.assert_close(narrow.double(), wide, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_where_a_distance_is_zero():
+    """At rest at the goal, the tip of a cone: float32 and float64 agree, and nothing is NaN."""
+    given = [torch.zeros(n, requires_grad=True) for n in (2, 1)]
+    step = Step(cylinder_in_cylinder.Damping.id)
+    found = step(*given)
+    (by_state,) = torch.autograd.grad(found.states.sum(), given[:1], retain_graph=True)
+    (slope,) = torch.autograd.grad(found.rewards, given[:1])
+    A, _ = step.task.scene.jacobian([0.0, 0.0], 1.2, step.task.dt)
+    np.testing.assert_allclose(by_state.numpy(), A.sum(axis=0), rtol=1e-6)
+    assert found.rewards == 1.0 and slope.tolist() == [0.0, 0.0]
 
 
 def test_errors(step):
