@@ -621,14 +621,17 @@ def _checked_task(task: Any) -> Task:
 
 
 def _check_reverse(*given: Any) -> None:
-    """Raise NotImplementedError inside torch.func, and for a tensor with a tangent, which would be lost."""
-    if torch._C._are_functorch_transforms_active():
-        raise NotImplementedError(
-            "TorchVectorEnv cannot be used inside torch.func (vmap, grad, jacrev, ...), because its calls "
-            "change the environments; use lag_envs.torch.Step there, or torch.autograd outside"
-        )
-    if any(isinstance(x, Tensor) and unpack_dual(x).tangent is not None for x in given):
-        raise NotImplementedError(REVERSE_ONLY)
+    """Raise NotImplementedError for tensors of torch.func, and for tangents, which would be lost."""
+    for x in given:
+        if not isinstance(x, Tensor):
+            continue
+        if torch.func.debug_unwrap(x, recurse=False) is not x:
+            raise NotImplementedError(
+                "TorchVectorEnv cannot be used inside torch.func (vmap, grad, jacrev, ...), because it "
+                "changes the environments; use lag_envs.torch.Step there, or torch.autograd outside"
+            )
+        if unpack_dual(x).tangent is not None:
+            raise NotImplementedError(REVERSE_ONLY)
 
 
 def _check(name: str, x: Any, shape: tuple[int, ...], *, whole: bool = False) -> None:
