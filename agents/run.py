@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
+import signal
 import sys
 import tempfile
 import time
@@ -305,6 +306,8 @@ def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[...,
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)
         def run(arguments: Sequence[str] | None = None) -> int:
+            if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see `agents/__init__.py`
+                signal.signal(signal.SIGINT, signal.default_int_handler)
             return run_shown(f"python -m {program}", lambda: main(arguments))
 
         return run

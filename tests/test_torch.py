@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 
 import lag_envs
 from lag_envs.envs.model import Model
-from lag_envs.tasks import TASKS, incline, pivoted_bar
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleExact
 
 torch = pytest.importorskip("torch")
@@ -78,6 +78,25 @@ def test_torch_func(step):
     for forward in (torch.func.jacfwd, torch.func.hessian):
         with pytest.raises(NotImplementedError, match="no forward mode and no second derivatives"):
             forward(lambda s: step(s, actions[0]).rewards)(states[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, for forward_ad
+def test_environments_refuse_what_would_lose_gradients(step):
+    """Tangents of forward mode, and transforms of torch.func."""
+    envs, (states, actions) = TorchVectorEnv(step.task.id, 2), (x.detach() for x in near(2))
+    envs.reset(seed=0)
+    before = envs.state.clone()
+    with torch.autograd.forward_ad.dual_level():
+        for call, given in [(envs.step, actions), (lambda x: envs.reset(options={"state": x}), states)]:
+            with pytest.raises(NotImplementedError, match=r"no forward mode .* use jacrev"):
+                call(torch.autograd.forward_ad.make_dual(given, torch.ones_like(given)))
+        envs.reset(options={"state": before})  # without a tangent
+    total = {"grad": lambda a: envs.step(a)[1].sum(), "vmap": lambda a: envs.step(a)[1]}
+    for name, rewards in total.items():
+        with pytest.raises(NotImplementedError, match=r"inside torch\.func .* use lag_envs\.torch\.Step"):
+            getattr(torch.func, name)(rewards)(actions[None] if name == "vmap" else actions)
+    assert torch.equal(envs.state, before)
+    assert torch.isfinite(envs.step(actions)[1]).all()
 
 
 def test_a_step_of_a_class(step):
@@ -332,6 +351,18 @@ def test_float32_at_ordinary_states(step, state):
         slopes[kind] = torch.autograd.grad(total, given)
     for narrow, wide in zip(*slopes.values(), strict=True):
         torch.testing.assert_close(narrow.double(), wide, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_where_a_distance_is_zero():
+    """At rest at the goal, the tip of a cone: float32 and float64 agree, and nothing is NaN."""
+    given = [torch.zeros(n, requires_grad=True) for n in (2, 1)]
+    step = Step(cylinder_in_cylinder.Damping.id)
+    found = step(*given)
+    (by_state,) = torch.autograd.grad(found.states.sum(), given[:1], retain_graph=True)
+    (slope,) = torch.autograd.grad(found.rewards, given[:1])
+    A, _ = step.task.scene.jacobian([0.0, 0.0], 1.2, step.task.dt)
+    np.testing.assert_allclose(by_state.numpy(), A.sum(axis=0), rtol=1e-6)
+    assert found.rewards == 1.0 and slope.tolist() == [0.0, 0.0]
 
 
 def test_errors(step):

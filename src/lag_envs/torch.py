@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 try:
     import torch
+    from torch.autograd.forward_ad import unpack_dual
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         f'{error.name} is missing: pip install "lag-envs[torch]"', name=error.name
@@ -45,6 +46,10 @@ from lag_envs.tasks.base import Task
 Tensor = torch.Tensor
 
 FIRST_ONLY = "a step has first derivatives only; leave out create_graph=True"
+REVERSE_ONLY = (
+    "a step has no forward mode and no second derivatives: use jacrev in place of jacfwd, and avoid jvp and "
+    "hessian"
+)
 
 
 class StepResult(NamedTuple):
@@ -293,7 +298,13 @@ class TorchVectorEnv:
             The observations.
         infos : dict
             Empty, or the diagnostics.
+
+        Raises
+        ------
+        NotImplementedError
+            As `step` does.
         """
+        _check_reverse(*(options or {}).values() if isinstance(options, Mapping | None) else ())
         if isinstance(self.envs, DeviceEnvs):
             return self.envs.reset(seed, options), {}
         state, _, mask = start_options(options, ("state", "target", "reset_mask"))
@@ -371,9 +382,12 @@ class TorchVectorEnv:
         ValueError, TypeError
             For actions that have another shape, type or device, or are not finite; then nothing is stepped.
             On a GPU, an action that is not finite ends its episode instead.
+        NotImplementedError
+            Inside a transform of `torch.func`, and for actions with a tangent (forward mode).
         ResetNeeded, StepRefused
             As `LagrangianVectorEnv.step` does.
         """
+        _check_reverse(actions)
         if isinstance(self.envs, DeviceEnvs):
             if torch.is_grad_enabled() and isinstance(actions, Tensor) and actions.requires_grad:
                 raise ValueError(
@@ -455,10 +469,7 @@ class _RowStep(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> NoReturn:
-        raise NotImplementedError(
-            "a step has no forward mode and no second derivatives: use jacrev in place of jacfwd, and avoid "
-            "jvp and hessian"
-        )
+        raise NotImplementedError(REVERSE_ONLY)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
@@ -607,6 +618,20 @@ def _checked_task(task: Any) -> Task:
             "no derivatives; leave these keywords out, or take an id without them"
         )
     return task
+
+
+def _check_reverse(*given: Any) -> None:
+    """Raise NotImplementedError for tensors of torch.func, and for tangents, which would be lost."""
+    for x in given:
+        if not isinstance(x, Tensor):
+            continue
+        if torch.func.debug_unwrap(x, recurse=False) is not x:
+            raise NotImplementedError(
+                "TorchVectorEnv cannot be used inside torch.func (vmap, grad, jacrev, ...), because it "
+                "changes the environments; use lag_envs.torch.Step there, or torch.autograd outside"
+            )
+        if unpack_dual(x).tangent is not None:
+            raise NotImplementedError(REVERSE_ONLY)
 
 
 def _check(name: str, x: Any, shape: tuple[int, ...], *, whole: bool = False) -> None:

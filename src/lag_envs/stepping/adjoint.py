@@ -6,8 +6,10 @@ recorded too. The result is printed like any other record, with the same arithme
 (`stepping/elementary.py`).
 
 Where a formula has kinks, the derivative is that of the branch that was taken: at a tie, ``minimum`` and
-``maximum`` use the first operand; at 0, ``abs`` has the derivative from above. Comparisons and ``floor``
-have the derivative 0. A branch that was not taken contributes exactly 0, whatever its numbers.
+``maximum`` use the first operand; at 0, ``abs`` has the derivative from above. At 0, where the slope of
+``sqrt`` is infinite, it counts as 0: most roots are distances, and the tip of a cone has no direction.
+Comparisons and ``floor`` have the derivative 0. A branch that was not taken contributes exactly 0, whatever
+its numbers.
 """
 
 from __future__ import annotations
@@ -109,7 +111,8 @@ class Differentiable(Trace):
         rate = RATES.get(str(node.op))
         if rate is None:
             raise TypeError(f"a formula calls {node.op!r}, of which there is no derivative")
-        return [(a, seed * rate(a, node, self))]
+        share = seed * rate(a, node, self)
+        return [(a, self.where(node <= 0.0, 0.0, share) if node.op == "sqrt" else share)]
 
     @staticmethod
     def _branches(nodes: Sequence[TracedNumber]) -> set[str]:

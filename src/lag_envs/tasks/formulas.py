@@ -120,7 +120,7 @@ class Lifted:
 _checked: weakref.WeakKeyDictionary[type, dict[tuple, tuple]] = weakref.WeakKeyDictionary()
 
 #: Attributes of a task whose numbers reach its code as constants, if at all.
-_NUMBERS = frozenset(
+NUMBERS = frozenset(
     ("scene", "dt", "duration", "fixed_target", "formulas", "given", "imperfections", "drawn", "_made_with")
 )
 
@@ -221,7 +221,7 @@ class TaskFormulas:
         plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
         if is_own(kind):
             # Besides these, the task's formulas use attributes, which may have been set by hand.
-            own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
+            own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in NUMBERS]
             shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
             formulas: Any = (*(getattr(kind, name) for name in FORMULAS), *own, *shared)
         else:
@@ -456,6 +456,12 @@ class TaskFormulas:
             self._check_numbers(name, dict(zip(entries, found[name], strict=True)), k, "numbers")
         code = trace.operations([ended, *itertools.chain(*found.values())])
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
+
+    def recorded_with(self, other: TaskFormulas) -> tuple[tuple[str, ...], str]:
+        """Return what determines the formulas, with the limits of actions of another task of this class."""
+        formulas = copy.copy(self)
+        formulas.acting, formulas.largest = other.acting, other.largest
+        return formulas._recorded()
 
     def _check_numbers(self, name: str, found: Mapping[str, Any], k: Any, wanted: str) -> None:
         """Raise a FormulaError if a recorded formula returns anything but numbers; named ones are finite."""
