@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
-import signal
 import sys
 import tempfile
 import time
@@ -306,8 +305,6 @@ def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[...,
     def decorated(main: Callable[..., int]) -> Callable[..., int]:
         @wraps(main)
         def run(arguments: Sequence[str] | None = None) -> int:
-            if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see `agents/__init__.py`
-                signal.signal(signal.SIGINT, signal.default_int_handler)
             return run_shown(f"python -m {program}", lambda: main(arguments))
 
         return run
