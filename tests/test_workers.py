@@ -32,8 +32,6 @@ def work(what):
         os.kill(os.getpid(), signal.SIGKILL)
     if what == "hangs":
         time.sleep(1000)
-    if what == "tells what it blocks":
-        return signal.pthread_sigmask(signal.SIG_BLOCK, [])
     if what == "raises":
         raise ValueError("no\nsuch")
     if what == "returns what cannot be sent":
@@ -56,13 +54,6 @@ def test_whatever_becomes_of_one_the_others_go_on():
     assert died(found["raises"]) == "ValueError: no"
     assert isinstance(found["returns what cannot be sent"], Exception)
     assert os.environ.get("OMP_NUM_THREADS") == threads
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-def test_ctrl_c_does_not_reach_processes_even_while_they_import():
-    with processes(1, begin, "hello") as submit:
-        assert signal.SIGINT in submit(work, "tells what it blocks").result()
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 @pytest.mark.parametrize("given", [["dies", "works"], slow(["hangs", "dies", "works"])])

@@ -66,8 +66,7 @@ def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator
     pool = _pool(count, begin, args)
 
     def submit(function: Callable, *args: Any, timeout: float | None = None) -> Future:
-        with _without_interrupts():
-            return pool.schedule(function, args=args, timeout=timeout)
+        return pool.schedule(function, args=args, timeout=timeout)
 
     try:
         yield submit
@@ -76,22 +75,6 @@ def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator
         pool.join()
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Let threads that start here, and processes that these start, never get Ctrl-C.
-
-    `_begin` lets the processes ignore it, but they would show a traceback while they import libraries.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _pool(count: int, begin: Callable | None, args: Sequence[Any]) -> Any:
