@@ -27,8 +27,7 @@ from typing import Any
 from lag_envs.envs import sharing
 from lag_envs.envs.lines import EACH_LANE, draw_lines, indented, next_episode, recorded_lines
 from lag_envs.stepping import primitives
-from lag_envs.stepping.compiling import BLOCK, compile_lines, indent
-from lag_envs.stepping.flows import split_lengths
+from lag_envs.stepping.compiling import BLOCK, compile_lines, indent, split_lengths
 from lag_envs.stepping.rows import Rows
 
 #: Random numbers reserved for one step.
