@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from lag_envs.report.general_results import CERTIFIED_ORDERS, DT, MEMBERS, content
-from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
+from lag_envs.report.linkage_rivals import ENGINES, differences
+from lag_envs.report.linkages import SYSTEMS, System
 from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.points import MODES
