@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.controllers.basic import Agent
 from lag_envs.leaderboard.fields import Strict
 from lag_envs.tasks.base import Task
 
@@ -99,7 +100,7 @@ class Head:
         return chosen[0] if self._single else np.stack(chosen, axis=1)
 
 
-class Agent(ABC):
+class Memoryless(Agent):
     """Base of the agents without memory; a subclass defines `act`.
 
     Parameters
@@ -126,7 +127,7 @@ class Agent(ABC):
         return actions.reshape((*values.shape[:-1], *actions.shape[1:])), state
 
 
-class Remembering(ABC):
+class Remembering(Agent):
     """Base of the agents with a memory in each episode; a subclass defines `begin` and `act`.
 
     Parameters
@@ -135,7 +136,6 @@ class Remembering(ABC):
         Turns numbers into actions.
     """
 
-    #: Its memory belongs to steps of one length.
     of_one_interval = True
 
     def __init__(self, head: Head) -> None:

@@ -14,10 +14,10 @@ from pydantic import Field, model_validator
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import (
     POLICY,
-    Agent,
     Architecture,
     Array,
     Head,
+    Memoryless,
     PolicyTable,
     Remembering,
 )
@@ -148,14 +148,14 @@ class Network(Architecture):
         if self.normalise:
             self.arrays |= {"obs_mean": (wide,), "obs_var": (wide,)}
 
-    def agent(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+    def agent(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         """Return the network."""
         if self.normalise and (arrays["obs_var"] < 0.0).any():
             raise Refused("obs_var must not be below 0")
         return self._made(arrays)
 
     @abstractmethod
-    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering: ...
+    def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering: ...
 
 
 class MLP(Network):
@@ -187,7 +187,7 @@ class MLP(Network):
         self.arrays = {}
         self._layers(task, table, wide, wide)
 
-    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+    def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         layers = _Layers(self, arrays)
         return _Feedforward(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
 
@@ -217,7 +217,7 @@ class GRU(Network):
         self.arrays |= {"weight_hh": (tall, self.memory), "bias_hh": (tall,)}
         self._layers(task, table, wide, self.memory)
 
-    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+    def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         return _Recurrent(_Layers(self, arrays), arrays)
 
 
@@ -266,7 +266,7 @@ class _Layers:
         return self.head.largest * np.tanh(x) if self.made.squash == "tanh" else x
 
 
-class _Feedforward(Agent):
+class _Feedforward(Memoryless):
     def __init__(self, layers: _Layers) -> None:
         super().__init__(layers.head)
         self.layers = layers
@@ -337,7 +337,7 @@ class Linear(Architecture):
         return _LinearFeedback(self.head, arrays["gain"], arrays["offset"])
 
 
-class _LinearFeedback(Agent):
+class _LinearFeedback(Memoryless):
     def __init__(self, head: Head, gain: Array, offset: Array) -> None:
         super().__init__(head)
         self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))
