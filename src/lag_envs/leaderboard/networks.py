@@ -18,6 +18,7 @@ from lag_envs.leaderboard.architecture import (
     Array,
     Head,
     Memoryless,
+    PageData,
     PolicyTable,
     Remembering,
 )
@@ -157,6 +158,24 @@ class Network(Architecture):
     @abstractmethod
     def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering: ...
 
+    @property
+    @abstractmethod
+    def _kind(self) -> dict[str, Any]:
+        """The kind of network, and the numbers of this kind, for a page."""
+
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData:
+        """Return the network's data."""
+        about = {
+            "layers": self.layers,
+            "activation": self.activation,
+            "bins": self.bins,
+            "controls": self.controls,
+            "squash": self.squash,
+            "mean_limit": self.mean_limit,
+            "normalise": self.normalise and self.normalise.model_dump(),
+        }
+        return PageData(about | self._kind, arrays, self.head)
+
 
 class MLP(Network):
     """A network of fully connected layers, evaluated in float64.
@@ -191,6 +210,10 @@ class MLP(Network):
         layers = _Layers(self, arrays)
         return _Feedforward(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
 
+    @property
+    def _kind(self) -> dict[str, Any]:
+        return {"kind": "mlp", "frames": self.frames, "padding": self.padding}
+
 
 class GRU(Network):
     """A gated recurrent unit, followed by fully connected layers, evaluated in float64.
@@ -219,6 +242,10 @@ class GRU(Network):
 
     def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         return _Recurrent(_Layers(self, arrays), arrays)
+
+    @property
+    def _kind(self) -> dict[str, Any]:
+        return {"kind": "gru", "memory": self.memory}
 
 
 class _Layers:
@@ -335,6 +362,10 @@ class Linear(Architecture):
     def agent(self, arrays: Mapping[str, Array]) -> _LinearFeedback:
         """Return the feedback."""
         return _LinearFeedback(self.head, arrays["gain"], arrays["offset"])
+
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData:
+        """Return the arrays, which say everything."""
+        return PageData({"kind": "linear"}, arrays, self.head)
 
 
 class _LinearFeedback(Memoryless):

@@ -52,7 +52,8 @@ class Controller:
     Parameters
     ----------
     place : str
-        Function that makes the controller from the task, "module:function".
+        Function that makes the controller from the task, "module:function". The controller must be a
+        `lag_envs.controllers.basic.Agent`.
     numbers : mapping
         Its keyword arguments.
     tune : mapping
