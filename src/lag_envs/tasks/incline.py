@@ -137,6 +137,7 @@ class Tilt(Task):
     )
     examples = Examples(
         start={"state": [0.1, -0.2, 0.05], "target": -0.2},
+        fast=[0.4, 100.0, 0.1],
         refused=[
             *({"state": state} for state in ([0.6, 0, 0], [0, 0, 0.11], [-0.6, 0, 0])),
             {"target": 0.6},
@@ -408,6 +409,7 @@ class Brake(Task):
     )
     examples = Examples(
         start={"state": [-1.5, 0.4]},
+        fast=[-1e3, 100.0],
         refused=[{"state": state} for state in ([0.1, 0.5], [0.0, 0.5], [-1.0, -0.1], [-2e3, 0])],
         ending=([-0.001, 1.0], -1.0),
         batch={

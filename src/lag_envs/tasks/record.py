@@ -251,6 +251,8 @@ class Examples:
         Options of a reset: a ``state`` in mid-task, and a ``target`` where there is one.
     moving : sequence of float, optional
         A faster state, for the recorded rollouts of the tests; by default the state of `start`.
+    fast : sequence of float, optional
+        A state at a large speed from which episodes work whatever the parameters, within their ranges.
     refused : sequence of mapping
         Options of resets that the task must refuse.
     ending : tuple, optional
@@ -267,6 +269,7 @@ class Examples:
 
     start: Mapping[str, Any] = field(default_factory=dict)
     moving: Sequence[float] | None = None
+    fast: Sequence[float] | None = None
     refused: Sequence[Mapping[str, Any]] = ()
     ending: tuple[Sequence[float], float] | None = None
     reach: float = 0.0
