@@ -81,8 +81,7 @@ class Tilt(Task):
 
     ## Numerical Accuracy
 
-    The equation is linear while the rate is held. It is stepped by its own Taylor series, summed to rounding;
-    with `control="tilt"` by its closed form.
+    The equation is linear while the rate is held. With `control="tilt"` it has a closed form.
 
     ## Known Returns
 
@@ -330,8 +329,8 @@ class Brake(Task):
 
     ## Numerical Accuracy
 
-    The motion is stepped in closed form, written so that no digits cancel at any drag. The crossing time is
-    found by Newton's method on the closed form, started just below it.
+    The closed form is written so that no digits cancel at any drag. The crossing time is found by Newton's
+    method, started just below it.
 
     ## Known Returns
 

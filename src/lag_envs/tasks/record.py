@@ -20,7 +20,7 @@ class Goal:
     Parameters
     ----------
     text : str
-        Success and time, in words.
+        What counts as success, and which time is reported: "success: ...; time: ..." (or "there is no time").
     hold : float or None
         The goal must hold without a break for this many seconds at the episode's end. None: it need not hold.
     terminated : bool or None
