@@ -315,8 +315,8 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
         texts.append(f"Stepped by an exact flow ({form.flow(task.dt).method}).")
     elif form and speed < 0.0:
         texts.append(
-            f"Stepped by Taylor series of order {form.order(task.dt)}. With some controls one series is never "
-            "enough, and the step is divided into parts by the proved bound."
+            f"Stepped by Taylor series of order {form.order(task.dt)}. With some controls one series is "
+            "never enough, and the step is divided into parts by the proved bound."
         )
     elif form:
         order = task.scene.step_bound(task.centre, task.limit_control, task.dt).order
