@@ -86,7 +86,7 @@ def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[R
 
 
 def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool = False) -> Row:
-    """Return the row of an episode of lag_envs; if requested, computed twice, with the difference."""
+    """Return the row of an episode of lag_envs; `vouch` adds how far two exact computations differ."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
         return chained(exact_stepping(task, seed, digits), [mpf(x) for x in start], episode.controls)

@@ -1,4 +1,4 @@
-"""Scenes defined by energies alone: error against time compared with other engines, certificates, energy.
+"""Scenes defined by energies alone: work-precision compared with other engines, certificates, energy.
 
 Each system takes one control step from the same harsh states, with every joint turning fast at once. All
 rivals run in compiled loops, with many states in one call, and the errors are those of the timed calls. Other
@@ -130,7 +130,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
         yield about | {"mass": mass, "acceleration": acceleration}
 
 
-# --- error against time ---
+# --- work-precision ---
 
 
 def system_rivals(family: str, quick: bool) -> list[Rival]:
