@@ -59,7 +59,7 @@ class Controller:
     tune : mapping
         Keywords that ``python -m agents.tune`` optimises, and the range of each.
     plans : bool
-        Whether it plans for some seconds before each episode.
+        Whether it plans in each episode, which may take seconds.
     real_time : mapping, optional
         For a controller whose planning takes longer than a step: the numbers with which it acts in real time.
     """
