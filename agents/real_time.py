@@ -37,7 +37,7 @@ def planning(env_id: str) -> Iterator[str]:
     """Yield the controllers of an environment that plan during an episode."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
-        if found.plans and not getattr(build(task, name), "plans_at_start", False):
+        if found.plans and not build(task, name).plans_at_start:
             yield name
 
 

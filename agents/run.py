@@ -56,10 +56,10 @@ def first_training_seed(seed: int) -> int:
 
 
 def training_seeds(first: int, count: int) -> range:
-    """Return `count` seeds of trainings, or raise a UserError if one would repeat another's episodes."""
+    """Return `count` training seeds, or raise a UserError if one would repeat another's episodes."""
     if first + count > SEEDS:
         raise UserError(
-            f"seeds of trainings must lie below {SEEDS}, so that no two share an episode; got up to "
+            f"training seeds must lie below {SEEDS}, so that no two share an episode; got up to "
             f"{first + count - 1}"
         )
     return range(first, first + count)

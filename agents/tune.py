@@ -77,7 +77,7 @@ and printed. The controllers' defaults were found in this way.
 
 With --settings, settings of {LEARNER} are tried: first the task's own, then others drawn at random,
 each with some training seeds, from {FIRST_TRAINING_SEED} on, which no reported result has (a file of an
-earlier version goes on from its own). FILE stores every training, so that the command can be interrupted
+earlier version keeps its own seeds). FILE stores every training, so that the command can be interrupted
 and run again, also with more --settings or --seeds. Copy the best settings by hand into the task's
 `hyperparameters`.
 

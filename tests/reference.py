@@ -18,7 +18,7 @@ from lag_envs.mechanics.recording import parameter_names
 from lag_envs.report import reference
 from lag_envs.report.cases import Case
 from lag_envs.report.extremes import amplification
-from lag_envs.report.oracle import Oracle
+from lag_envs.report.oracle import Oracle, agreed
 from lag_envs.report.stepped import Stepped
 
 EPS = 2.0**-53
@@ -32,6 +32,11 @@ def scene_of(name, params):
 def flow(scene_name, params, state, control, dt, dps=40):
     """Return the state after one step with the control held, with dps - 10 digits at least."""
     return reference.exact_flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
+
+
+def agreed_end(oracle, state, controls, dt, digits=30):
+    """Return the oracle's own end state, with no closed form, as two of its computations agree on it."""
+    return agreed(lambda working: oracle.once(state, controls, dt, working), digits)
 
 
 def linear(gamma, delta, slope, x, v, dt):

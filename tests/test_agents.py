@@ -268,7 +268,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path, monkeypatch):
         (["--algo", "fastppo"], "did you mean fast_ppo"),
         (["--steps", "0"], "--steps must lie between 1"),
         (["--seed", "-1"], "--seed must lie between"),
-        (["--seed", "1000"], "seeds of trainings must lie below 1000"),
+        (["--seed", "1000"], "training seeds must lie below 1000"),
     ],
 )
 def test_demo_says_what_is_wrong(arguments, message, demonstrate):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import sympy
 from contract_scenes import cart
+from reference import agreed_end
 from sympy.physics.vector import dynamicsymbols
 
 from lag_envs.mechanics.algebra import FormulaError
@@ -250,7 +251,7 @@ def test_differences_of_parameters_keep_their_digits():
     np.testing.assert_allclose(scene.mass_matrix(state), mass, rtol=1e-15)
     found = scene.acceleration(state, control)
     np.testing.assert_allclose([found["x"], found["theta"]], acceleration, rtol=1e-13)
-    exact = [float(x) for x in oracle_of(scene).flow(state, control, 1e-4)]
+    exact = [float(x) for x in agreed_end(oracle_of(scene), state, control, 1e-4)]
     np.testing.assert_allclose(scene.simulate(state, [control], 1e-4)[-1], exact, rtol=1e-13)
 
 
@@ -312,7 +313,7 @@ def test_wells_about_a_far_place_take_few_substeps(where, products):
     scene, control = Wells(where=where, products=products), [0.1]
     for d, e in ((0.75, 0.4), (-1.9, -1.1), (1.3, 0.2)):
         state = np.array([where + d, 0.3, where + d + e, -0.5])
-        exact = np.array([float(x) for x in oracle_of(scene).flow(state, control, 0.02)])
+        exact = np.array([float(x) for x in agreed_end(oracle_of(scene), state, control, 0.02)])
         error = np.abs(scene.simulate(state, [control], 0.02)[-1] - exact)
         assert (error <= 1e-15 * np.maximum(1.0, np.abs(state))).all()
         assert scene.step_bound(state, control, 0.02).substeps <= 3

@@ -6,7 +6,7 @@ import sympy
 from covering import every, slow
 from mpmath import mp, mpf
 from plain_target import FLOATS
-from reference import conditioning, flow, linear, moving_plane, random_cases, scales
+from reference import agreed_end, conditioning, flow, linear, moving_plane, random_cases, scales
 from series_systems import SYSTEMS, acceleration
 
 from lag_envs import scenes
@@ -85,7 +85,7 @@ def test_what_goes_far_is_by_the_closed_form(track, monkeypatch):
     """The bar's own equation is recognised, but only if undamped, with its moving support or without one."""
     bar, start = scenes.PivotedBar(track=track), [0.3, -0.2][: 2 if track else 0]
     state = [*start, 2.0, 3.0]
-    exact = oracle_of(bar).flow(state, 4.0, 1.5)
+    exact = agreed_end(oracle_of(bar), state, 4.0, 1.5)
     monkeypatch.setattr(Oracle, "once", None)  # not called
     assert distance(reference.exact_flow(bar, state, 4.0, 1.5), exact) < 1e-29
     with pytest.raises(TypeError):
@@ -329,7 +329,7 @@ def test_floats_are_taken_as_they_are():
         def potential(self, q, xp):
             return -(self.push + 0.1) * q.x
 
-    x, v = oracle_of(Slide()).flow([0.0, 0.0], [], 1.0, 40)
+    x, v = agreed_end(oracle_of(Slide()), [0.0, 0.0], [], 1.0, 40)
     assert abs(v - 2 * mpf(0.1)) < 1e-39 < abs(v - mpf(1) / 5) and abs(x - mpf(0.1)) < 1e-39
 
 
@@ -347,7 +347,7 @@ def test_functions_of_a_formula():
             return getattr(xp, self.kind)(0.5 + q.x**2)
 
     for kind in ("tan", "tanh", "atan", "exp", "log", "sqrt", "sin", "cos"):
-        x, v = oracle_of(Hill(kind=kind)).flow([0.3, 0.2], [], 0.5, 40)
+        x, v = agreed_end(oracle_of(Hill(kind=kind)), [0.3, 0.2], [], 0.5, 40)
         f = getattr(mp, kind)
         energy = [w**2 / 2 + f(mpf(0.5) + y**2) for y, w in ((mpf(0.3), mpf(0.2)), (x, v))]
         assert abs(energy[1] - energy[0]) < 1e-39, kind
@@ -369,12 +369,12 @@ class Wall(Scene):
 
 def test_a_motion_into_a_singular_point_is_unresolved():
     with pytest.raises(Unresolved):
-        oracle_of(Wall()).flow([1e-3, -10.0], [], 0.01)
+        agreed_end(oracle_of(Wall()), [1e-3, -10.0], [], 0.01)
 
 
 def test_a_motion_to_the_edge_of_one_is_resolved():
     """It comes as near as 1e-25, and leaves with its initial energy."""
-    x, v = oracle_of(Wall(sign=-1.0)).flow([1e-3, -10.0], [], 0.01)
+    x, v = agreed_end(oracle_of(Wall(sign=-1.0)), [1e-3, -10.0], [], 0.01)
     assert v > 0 and abs(v**2 / 2 - mp.log(x) - 50 + mp.log(mpf(1e-3))) < 1e-27
 
 
@@ -387,9 +387,9 @@ def test_a_power_that_it_does_not_know_is_named():
 def test_a_state_of_another_length_is_refused():
     oracle = oracle_of(scenes.PivotedBar(track=None))
     with pytest.raises(ValueError, match="state must have 2 entries, got 4"):
-        oracle.flow([0.0, 0.0, 1.0, 2.0], 0.0, 0.02)
+        agreed_end(oracle, [0.0, 0.0, 1.0, 2.0], 0.0, 0.02)
     with pytest.raises(ValueError, match="controls must have 1 entries, got 2"):
-        oracle.flow([1.0, 2.0], [0.0, 0.0], 0.02)
+        agreed_end(oracle, [1.0, 2.0], [0.0, 0.0], 0.02)
 
 
 def test_it_shares_no_code_with_what_it_checks():

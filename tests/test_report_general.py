@@ -8,7 +8,8 @@ import pytest
 from covering import slow
 
 from lag_envs.report import general, general_results
-from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
+from lag_envs.report.linkage_rivals import ENGINES, differences
+from lag_envs.report.linkages import SYSTEMS
 from lag_envs.report.motions import CertifiedSeries, SceneEquation, SceneProblems
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.peers import Heyoka

@@ -36,6 +36,7 @@ from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, Scene, Step
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import absent_from
+from lag_envs.stepping.flow_code import flow_code
 from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.stepping.slope import FixedSlope, TurningSlope
 from lag_envs.tasks import TASKS
@@ -67,13 +68,13 @@ def coefficients(scene):
 
 def operations(scene):
     """Return the number of operations of an ordinary step."""
-    return form_of(scene).code(0.02, absent_from(motion_constants_of(scene))).operations
+    return flow_code(form_of(scene), 0.02, absent_from(motion_constants_of(scene))).operations
 
 
 def advance_of(scene, dt):
     """Return the scene's compiled step, and its arguments after state, control and step."""
     constants = motion_constants_of(scene)
-    code = form_of(scene).code(dt, absent_from(constants))
+    code = flow_code(form_of(scene), dt, absent_from(constants))
     return code.compile(), [form_of(scene).largest_majorant(dt), *(v for v in constants.values() if v)]
 
 

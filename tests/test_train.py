@@ -458,7 +458,7 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         ([ENV, "--algo", "sacc"], "did you mean sac"),
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
-        ([ENV, "--first-seed", "1000"], "seeds of trainings must lie below 1000, so that no two share"),
+        ([ENV, "--first-seed", "1000"], "training seeds must lie below 1000, so that no two share"),
         ([ENV, "--seeds", "1001"], "no two share an episode; got up to 1000"),
         ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
         ([CartPoleExact.id, "--algo", "ppo", "sac"], "sac needs continuous actions; CartPole"),

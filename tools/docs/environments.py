@@ -85,7 +85,7 @@ def environment_page(
     parts["Arguments"] = [arguments(task), prose.get("Arguments", "")]
     parts["Equations"].insert(0, _equations(task))
     parts["Signs and Units"].append(_state(task))
-    parts["Numerical Accuracy"].append(_accuracy(env_id, task, accuracy))
+    parts["Numerical Accuracy"].insert(0, _accuracy(env_id, task, accuracy))
     parts["Known Returns"] += [_returns(env_id), _open(env_id)]
     parts["Agents"].append(_agents(env_id, task, board))
     drive = f"[Drive it yourself, and watch its agents](../board/{env_id}.html)."
@@ -310,8 +310,15 @@ def _state(task: Task) -> str:
 
 
 def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> str:
-    speed, texts = task.certified_speed(), []
-    if speed is not None and speed >= 0.0:
+    form, speed, texts = form_of(task.scene), task.certified_speed(), []
+    if form and speed is None:
+        texts.append(f"Stepped by an exact flow ({form.flow(task.dt).method}).")
+    elif form and speed < 0.0:
+        texts.append(
+            f"Stepped by Taylor series of order {form.order(task.dt)}. With some controls one series is "
+            "never enough, and the step is divided into parts by the proved bound."
+        )
+    elif form:
         order = task.scene.step_bound(task.centre, task.limit_control, task.dt).order
         rate = f"{layout_of(task.scene).free[0]}_dot"
         texts.append(
@@ -320,7 +327,7 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
             f"{math.floor(10.0 * speed) / 10.0:.1f} rad/s, whatever the control. Above this speed, the step "
             "is divided into parts by the same bound."
         )
-    if form_of(task.scene) is None:
+    else:
         texts.append(
             "Stepped by Taylor series, each with a proved bound on its truncation error. If the bound "
             f"exceeds {TOLERANCE:.0e} of the velocities' size, the step is divided. If dividing does not "

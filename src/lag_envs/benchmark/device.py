@@ -175,7 +175,7 @@ def _in_graph(run: Run, device: torch.device) -> Run:
 
 
 def _peer(env_id: str, size: int, device: torch.device, dtype: torch.dtype) -> dict[str, tuple[Run, int]]:
-    """Return steps of gymnax's environment of the same task, and how many a call takes, if it can run."""
+    """Return a run of gymnax's version of a task, and its number of steps; nothing if it cannot run."""
     name = TASKS[env_id].peer if env_id in TASKS else ""
     if not name or dtype != torch.float32 or device.type != "cuda":
         return {}

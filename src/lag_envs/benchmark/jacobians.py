@@ -18,7 +18,7 @@ from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.scenes import Scene
 from lag_envs.scenes.derivation import code_of, form_of, motion_constants_of, step_argument_of
 from lag_envs.stepping.compiling import compile_lines, indent
-from lag_envs.stepping.flows import lift_lines
+from lag_envs.stepping.flow_code import lift_lines
 from lag_envs.tasks import TASKS
 from lag_envs.workers import stopping_point
 

@@ -106,9 +106,9 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
 REPORT = Command(
     "report",
     "measure errors, and write a page about them",
-    """Measure the error of every environment and scene against high precision, beside common
-integrators and other libraries: error against run time, the bound, stability on stiff and
-extreme cases, conservation. Writes a folder with index.html, figures, tables as CSV and
+    """Measure the error of every environment and scene against high-precision results, and compare
+it with common integrators and other libraries: work-precision diagrams, the bound, stability on
+stiff and extreme cases, conservation. Writes a folder with index.html, figures, tables as CSV and
 everything as JSON. Finished jobs are kept, so run it again to resume after Ctrl-C. heyoka,
 diffrax, torchdiffeq, MuJoCo and Pinocchio take part if they are installed.
 

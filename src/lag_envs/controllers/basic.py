@@ -34,7 +34,35 @@ class FeedbackLaw(NamedTuple):
     read: ObservationDecoder | None  #: computes x from the observation; None if x is the observation
 
 
-class Constant:
+class Agent(ABC):
+    """What our agents have besides `predict`; of agents of other libraries, only `predict` is asked.
+
+    Attributes
+    ----------
+    random : bool
+        Whether it draws random numbers, for all episodes together.
+    of_one_interval : bool
+        Whether its memory belongs to steps of one length.
+    plans_at_start : bool
+        Whether all planning is done at the start of an episode.
+    """
+
+    random = False
+    of_one_interval = False
+    plans_at_start = False
+
+    @abstractmethod
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the action for each observation, and the state to pass to the next call."""
+
+    def law(self, task: Task) -> FeedbackLaw | None:
+        """Return the agent as feedback; None if it is not pure feedback."""
+        return None
+
+
+class Constant(Agent):
     """Always the same action.
 
     Parameters
@@ -67,7 +95,7 @@ def constant(task: Task, *, action: Any) -> Constant | Choice:
     return Choice(task, choice=action)
 
 
-class Feedback:
+class Feedback(Agent):
     """Actions that are linear in the observation, clipped.
 
     Parameters
@@ -106,7 +134,7 @@ def feedback(task: Task, **gains: float) -> Feedback:
     return Feedback(task, gain=[[gains.get(name, 0.0) for name in task.observation]])
 
 
-class Switch:
+class Switch(Agent):
     """The largest control, in the direction given by the sign of a weighted sum of observations.
 
     Parameters
@@ -139,7 +167,7 @@ def do_nothing(of: gym.Env | Task) -> Constant | Choice:
     return Choice(task) if task.formulas.choices else Constant(task.rest_action)
 
 
-class Choice:
+class Choice(Agent):
     """In tasks whose actions are choices, always the same choice, or a random one.
 
     Parameters
@@ -155,7 +183,7 @@ class Choice:
     def __init__(
         self, task: Task, *, choice: ArrayLike | None = None, rng: np.random.Generator | None = None
     ) -> None:
-        self.task, self.rng = task, rng
+        self.task, self.rng, self.random = task, rng, rng is not None
         self.choice = np.asarray(task.rest_action if choice is None else choice, np.int64)
         self.shape = Actions(task.formulas).shape
 
@@ -170,7 +198,7 @@ class Choice:
         return self.rng.integers(choices if self.shape else choices[0], size=shape), state
 
 
-class Random:
+class Random(Agent):
     """Uniformly random actions.
 
     Parameters
@@ -182,6 +210,8 @@ class Random:
     largest : float
         The largest action.
     """
+
+    random = True
 
     def __init__(self, seed: int, count: int = 1, largest: float = 1.0) -> None:
         self.rng, self.count, self.largest = np.random.default_rng(seed), count, largest
@@ -201,7 +231,7 @@ def at_random(task: Task, seed: int = 0) -> Random | Choice:
     return Random(seed, task.formulas.actions, task.formulas.largest)
 
 
-class FeedbackController(ABC):
+class FeedbackController(Agent):
     """Base of the controllers without memory, whose control depends on the state alone.
 
     A subclass defines `control`. Controls beyond the task's limit are clipped.

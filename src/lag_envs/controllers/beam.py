@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_counts
+from lag_envs.controllers.basic import Agent, Array, ObservationDecoder, beginning, check_counts
 from lag_envs.controllers.mpc import without_kicks
 from lag_envs.controllers.swing_up import away
 from lag_envs.envs.model import Model
@@ -52,7 +52,7 @@ class Followed(NamedTuple):
     left: Array  # (n, horizon)
 
 
-class BeamSearch:
+class BeamSearch(Agent):
     """Search for the best sequence of listed actions on the exact model, and follow it.
 
     All states of a level are stepped with all actions. The resulting states are divided into cells, and only

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import Array, actions_for
+from lag_envs.controllers.basic import Agent, Array, actions_for
 from lag_envs.controllers.linear import Regulator
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks.base import Task
@@ -55,9 +55,7 @@ class Pumped(Regulator):
         holds = in_charge(self.cost_to_go(x), state, episode_start, self.catch, self.lose)
         return actions_for(self.task, np.where(holds, self.control(x, target), self.swing(x))), holds
 
-    def law(self, task: Task) -> None:
-        """Return None, as this controller is not pure feedback."""
-        return
+    law = Agent.law  # not pure feedback, as the regulator is
 
 
 class PivotEnergyLQR(Pumped):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import (
+    Agent,
     Array,
     ObservationDecoder,
     beginning,
@@ -32,7 +33,7 @@ class Belief(NamedTuple):
     memory: Any  # of the controller
 
 
-class Filtered:
+class Filtered(Agent):
     """Act on a state estimate from an extended Kalman filter on the exact model [1]_.
 
     Between observations the estimate follows the model, and its covariance follows the model's exact
@@ -61,8 +62,7 @@ class Filtered:
     .. [1] R. F. Stengel, "Optimal control and estimation", Dover 1994, section 4.7.
     """
 
-    #: The belief holds for steps of one length.
-    of_one_interval = True
+    of_one_interval = True  # as the belief holds for steps of one length
 
     def __init__(self, task: Task, controller: Any, *, drift: float = 0.0) -> None:
         check_single_control("Filtered", task)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, beginning, check_continuous
+from lag_envs.controllers.basic import Agent, Array, ObservationDecoder, beginning, check_continuous
 from lag_envs.envs.model import REACH, Model
 from lag_envs.scenes.derivation import form_of
 from lag_envs.tasks.base import Task
@@ -35,7 +35,7 @@ class Plan(NamedTuple):
     memory: Any  # of the controller that continues after the plan
 
 
-class ILQR:
+class ILQR(Agent):
     """Plan each episode at its start with the exact model, and follow the plan by time-varying feedback.
 
     Planning starts from the actions of another controller. Each iteration expands the model along the
@@ -70,7 +70,6 @@ class ILQR:
        1168-1175.
     """
 
-    #: All planning is done at the start of an episode.
     plans_at_start = True
 
     def __init__(
@@ -327,7 +326,7 @@ class ILQR:
         return change, gains
 
 
-class Opening:
+class Opening(Agent):
     """A guess with a different beginning: one action for a while, then another controller.
 
     Parameters

@@ -107,8 +107,8 @@ class SwitchingLine(FeedbackController):
         self.speed = task.gentle if speed is None else speed
         self.model = Model(task)
         # No brake gets below the terminal speed under full brake.
-        pull, rate = task.coefficients([0.0, 0.0], [task.limit_control], np)
-        settled = pull / rate
+        acceleration, rate = task.coefficients([0.0, 0.0], [task.limit_control], np)
+        settled = acceleration / rate
         self.speed, fastest = max(self.speed, 1.02 * settled), max(fastest, 3.0 * settled)
         # In ten times 1/rate the excess of speed falls to 5e-5 of its initial value.
         run = task.scene.simulate([0.0, fastest], [task.limit_control] * POINTS, 10.0 / rate / POINTS)

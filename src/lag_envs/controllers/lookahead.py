@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.basic import Agent, ObservationDecoder
 from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
 
-class Clocked(ABC):
+class Clocked(Agent):
     """Base of the agents whose action depends on state, target and time; a subclass defines `act`.
 
     Their memory is the number of steps taken in each episode.

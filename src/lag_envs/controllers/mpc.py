@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import (
+    Agent,
     Array,
     ObservationDecoder,
     beginning,
@@ -48,7 +49,7 @@ class Ahead(NamedTuple):
     coming: tuple[Coming, ...] = ()
 
 
-class MPC:
+class MPC(Agent):
     """Plan ahead on the exact model, follow the plan, and plan again every few steps or after a surprise.
 
     A new plan starts from the rest of the old one, followed with its feedback and improved by a few
@@ -105,6 +106,8 @@ class MPC:
         Seed of the guesses. All episodes share the random numbers, so a plan may depend on the plans made
         before; a new agent starts over.
     """
+
+    random = True  # it draws guesses
 
     def __init__(
         self,

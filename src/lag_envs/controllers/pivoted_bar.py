@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
+from lag_envs.controllers.basic import Agent, Array, ObservationDecoder, as_actions
 from lag_envs.controllers.energy import in_charge
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
@@ -22,7 +22,7 @@ UPRIGHT = (0.0, 0.0, math.pi, 0.0)
 TUNED = {True: (2.5, 1.5), False: (5.8, 3.8)}
 
 
-class EnergyShapingLQR:
+class EnergyShapingLQR(Agent):
     """Pump a bar up to the energy of the upright rest, then hold it by a linear-quadratic regulator.
 
     Far from upright, the support is accelerated in the direction that does work on the bar [1]_, and, on a
@@ -123,7 +123,7 @@ class Estimate(NamedTuple):
     holds: NDArray[np.bool_]
 
 
-class AdaptiveEnergyShapingLQR:
+class AdaptiveEnergyShapingLQR(Agent):
     """Swing up a bar of unknown length and friction: estimate both while moving, and act on them.
 
     The bar moves by θ'' = -q (g sinθ + u cosθ) - γ θ', where q = m L/(m L² + I) follows from its length. This

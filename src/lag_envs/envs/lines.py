@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lag_envs.stepping.compiling import indent
-from lag_envs.stepping.flows import section
+from lag_envs.stepping.compiling import indent, section
 from lag_envs.stepping.tracing import Trace
 
 #: The loop over the lanes of a block, which go on side by side.

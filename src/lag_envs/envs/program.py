@@ -27,8 +27,7 @@ from typing import Any
 from lag_envs.envs import sharing
 from lag_envs.envs.lines import EACH_LANE, draw_lines, indented, next_episode, recorded_lines
 from lag_envs.stepping import primitives
-from lag_envs.stepping.compiling import BLOCK, compile_lines, indent
-from lag_envs.stepping.flows import split_lengths
+from lag_envs.stepping.compiling import BLOCK, compile_lines, indent, split_lengths
 from lag_envs.stepping.rows import Rows
 
 #: Random numbers reserved for one step.
@@ -404,57 +403,11 @@ class Program:
 
     @cached_property
     def step_blocks(self) -> Callable:
-        """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
-        y, inputs = self.y, self._inputs
-        ordinary = self._load(["ordinary"])
-        results = ["n", "over", "r", *self.o, *(["clock"] if self.sensing else [])]
-        counted = ["clock = n"] if self.sensing else []
-        key = [self._key] if self.kick else []
-        ends = list(zip(self.in_force, self.in_force_after, strict=True))
-        refused = [*self._load(self.held, self.asked), *self._store(self.asked)] if self.asked else []
-        # If the fast formula does not hold, or the last reward is special, the start is kept for a second
-        # attempt.
-        holds = "within and not over > 0.0" if self.last else "within"
-        main = [
-            *inputs, *self._to_end,
-            "again = n < 0.0", *self.outcome,
-            f"plain = {holds}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
-            "n = n + 1.0", *counted, "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
-            *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
-            "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
-            *(f"{start} = select(plain, {end}, {start})" for start, end in ends),
-            *self.observe, *self._store([*y, *([] if self._move_lanes else [*self.u, *self.reaching])]),
-            *self._store(self.u[: len(ends)], self.in_force),
-            *self._store([*results, "ordinary"]),
-        ]  # fmt: skip
-        special = [
-            *ordinary,
-            "if ordinary == 0.0:",
-            *indent([
-                *inputs, *self._to_end_again,
-                "if status < 0:",
-                "    refused = max(refused, first + i + np.uint64(1))",
-                *indent([*self._store(["over", "r"], ["0.0", "np.nan"]), *refused]),  # not a reward: the mark
-                "else:",
-                *indent([
-                    *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
-                    "n = n + 1.0", *counted,
-                    "if n >= k_limit:", "    over = over + 2.0",
-                    *key, *self.kick, *self.move, *self.observe,
-                    "if over > 0.0:", "    n = -over",
-                    *self._store([*y, *self.u[: len(ends)], *results], [*y, *self.in_force_after, *results]),
-                    *(self._store(["ordinary"], ["1.0"]) if self.sensing else []),
-                ]),
-            ]),
-            "elif ordinary == 2.0:",
-            *indent([
-                *self._load([*(f"k_{name}" for name in self.varying), *self.g]),
-                *next_episode("first + i", "second + first + i", "last + first + i"),
-                "state_given, target_given = False, False", *self._start, *self._begin_lane,
-                "r = 0.0", "over = 0.0",
-                *self._store([*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
-            ]),
-        ]  # fmt: skip
+        """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`.
+
+        All lanes of a block take an ordinary step first. Then come those that this left: starts of episodes,
+        and steps for which the fast formula does not hold, or whose last reward is special.
+        """
         output = [
             *self._load(["r", "over"]), "reward[first + i] = r",
             "terminated[first + i] = (over == 1.0) | (over == 3.0)", "truncated[first + i] = over >= 2.0",
@@ -473,9 +426,9 @@ class Program:
                     for line in indented(EACH_LANE, self._store([a], [f"action[{self._action(j)}]"]))
                 ),
                 *self._command_lanes, *self._move_lanes,
-                *indented(EACH_LANE, main),
-                *indented(EACH_LANE, [*ordinary, "special += ordinary != 1.0"]),
-                "if special > 0:", *indent(indented(EACH_LANE, special)),
+                *indented(EACH_LANE, self._ordinary_step),
+                *indented(EACH_LANE, [*self._load(["ordinary"]), "special += ordinary != 1.0"]),
+                "if special > 0:", *indent(indented(EACH_LANE, self._special_step)),
                 *self._sense_lanes,
                 *indented(EACH_LANE, output),
                 *self._show_block,
@@ -485,6 +438,81 @@ class Program:
         return compile_lines(
             "step_blocks", sharing.STEP_BLOCKS, body, engine(), *sharing.claiming(), inner=True
         )
+
+    @property
+    def _ordinary_step(self) -> list[str]:
+        """The lines of a lane's ordinary step; ``ordinary`` is 1 if it was one, 2 if an episode starts, or 0.
+
+        Only the state after an ordinary step is kept; otherwise the start is, for `_special_step`.
+        """
+        holds = "within and not over > 0.0" if self.last else "within"
+        return [
+            *self._inputs, *self._to_end,
+            "again = n < 0.0", *self.outcome,
+            f"plain = {holds}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
+            "n = n + 1.0", *self._counted, "over = select(n >= k_limit, over + 2.0, over)",
+            *self._kick_of_lane,
+            *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
+            "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
+            *(f"{start} = select(plain, {end}, {start})" for start, end in self._forced),
+            *self.observe, *self._store([*self.y, *([] if self._move_lanes else [*self.u, *self.reaching])]),
+            *self._store(self.u[: len(self._forced)], self.in_force),
+            *self._store([*self._results, "ordinary"]),
+        ]  # fmt: skip
+
+    @property
+    def _special_step(self) -> list[str]:
+        """The lines of a lane that has taken no ordinary step: any other step, or the start of an episode."""
+        refused = [*self._load(self.held, self.asked), *self._store(self.asked)] if self.asked else []
+        ends = [*self.y, *self.u[: len(self._forced)], *self._results]
+        return [
+            *self._load(["ordinary"]),
+            "if ordinary == 0.0:",
+            *indent([
+                *self._inputs, *self._to_end_again,
+                "if status < 0:",
+                "    refused = max(refused, first + i + np.uint64(1))",
+                *indent([*self._store(["over", "r"], ["0.0", "np.nan"]), *refused]),  # not a reward: the mark
+                "else:",
+                *indent([
+                    *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
+                    "n = n + 1.0", *self._counted,
+                    "if n >= k_limit:", "    over = over + 2.0",
+                    *self._kick_of_lane, *self.move, *self.observe,
+                    "if over > 0.0:", "    n = -over",
+                    *self._store(ends, [*self.y, *self.in_force_after, *self._results]),
+                    *(self._store(["ordinary"], ["1.0"]) if self.sensing else []),
+                ]),
+            ]),
+            "elif ordinary == 2.0:",
+            *indent([
+                *self._load([*(f"k_{name}" for name in self.varying), *self.g]),
+                *next_episode("first + i", "second + first + i", "last + first + i"),
+                "state_given, target_given = False, False", *self._start, *self._begin_lane,
+                "r = 0.0", "over = 0.0",
+                *self._store([*self.y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
+            ]),
+        ]  # fmt: skip
+
+    @property
+    def _results(self) -> list[str]:
+        """The rows that a step leaves besides the state."""
+        return ["n", "over", "r", *self.o, *(["clock"] if self.sensing else [])]
+
+    @property
+    def _counted(self) -> list[str]:
+        """The line that gives sensors the step's number."""
+        return ["clock = n"] if self.sensing else []
+
+    @property
+    def _kick_of_lane(self) -> list[str]:
+        """The lines of a random kick."""
+        return [self._key, *self.kick] if self.kick else []
+
+    @property
+    def _forced(self) -> list[tuple[str, str]]:
+        """The rows of the controls in force at a step's start, each with that at its end."""
+        return list(zip(self.in_force, self.in_force_after, strict=True))
 
     @property
     def _inputs(self) -> list[str]:

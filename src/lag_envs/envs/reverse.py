@@ -22,7 +22,7 @@ from lag_envs.mechanics.recording import parameter_names
 from lag_envs.scenes.derivation import code_of, form_of
 from lag_envs.scenes.steps import check_turns, derivatives_of, vjp_of_rows
 from lag_envs.stepping.adjoint import Differentiable, LaneFormula
-from lag_envs.stepping.flows import split_lengths
+from lag_envs.stepping.compiling import split_lengths
 from lag_envs.stepping.normal_forms import lifted
 from lag_envs.stepping.tracing import Trace, clip
 from lag_envs.tasks.base import Task

@@ -45,9 +45,8 @@ from lag_envs.mechanics.recording import parameter, parameter_names, parameter_v
 from lag_envs.scenes import picture
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, series_order_of
 from lag_envs.scenes.shapes import Frame
-from lag_envs.stepping.compiling import absent_from
+from lag_envs.stepping.compiling import absent_from, split_lengths
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.flows import split_lengths
 from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, run_python, script_motion
 from lag_envs.stepping.series import TOLERANCE

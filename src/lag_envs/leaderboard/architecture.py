@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.controllers.basic import Agent
 from lag_envs.leaderboard.fields import Strict
 from lag_envs.tasks.base import Task
 
@@ -64,6 +65,10 @@ class Architecture(ABC):
     def agent(self, arrays: Mapping[str, Array]) -> Any:
         """Return the agent; raise Refused if the arrays' values do not fit."""
 
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData | None:
+        """Return the data with which a page runs the policy; None if only Python can run it."""
+        return None
+
 
 class Head:
     """Turns numbers into actions of a task: clipped to their range, or the largest number picks from a list.
@@ -99,7 +104,27 @@ class Head:
         return chosen[0] if self._single else np.stack(chosen, axis=1)
 
 
-class Agent(ABC):
+class PageData(NamedTuple):
+    """What a page needs to run a policy; ``static/drive.js`` has the code."""
+
+    about: dict[str, Any]  #: the kind of policy, and its numbers, in JSON types
+    arrays: Mapping[str, Array]
+    head: Head
+
+
+def feedback_data(agent: Agent, task: Task) -> PageData | None:
+    """Return a page's data about an agent that is pure feedback; None for any other."""
+    law = agent.law(task)
+    if law is None:
+        return None
+    if law.read is None:
+        arrays = {"gain": -law.gains[0].T, "offset": law.actions[0]}
+        return PageData({"kind": "linear"}, arrays, Head(task))
+    arrays = {"states": law.states, "actions": law.actions, "gains": law.gains}
+    return PageData({"kind": "plan", "read": law.read.numbers()}, arrays, Head(task))
+
+
+class Memoryless(Agent):
     """Base of the agents without memory; a subclass defines `act`.
 
     Parameters
@@ -126,7 +151,7 @@ class Agent(ABC):
         return actions.reshape((*values.shape[:-1], *actions.shape[1:])), state
 
 
-class Remembering(ABC):
+class Remembering(Agent):
     """Base of the agents with a memory in each episode; a subclass defines `begin` and `act`.
 
     Parameters
@@ -135,7 +160,6 @@ class Remembering(ABC):
         Turns numbers into actions.
     """
 
-    #: Its memory belongs to steps of one length.
     of_one_interval = True
 
     def __init__(self, head: Head) -> None:

@@ -1,4 +1,4 @@
-"""Check a board as a whole: everything on it must be as it was logged, and come out again when repeated.
+"""Check a board as a whole: everything on it must be as it was logged, and reproducible.
 
 After the cheap checks (`lag_envs.leaderboard.checks`), `audit` makes the slow ones: each nonce against its
 public source, and results against the submissions, by playing episodes again.

@@ -12,7 +12,7 @@ from pydantic import model_validator
 
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.controllers.lookahead import Clocked, LookAhead
-from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, Head, PolicyTable
+from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, Head, PageData, PolicyTable
 from lag_envs.leaderboard.fields import between, length_between, line, shown_ascii
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
@@ -106,6 +106,22 @@ class GridArchitecture(Architecture):
         listed, largest = self.head.choices, self.head.largest
         tried = np.arange(float(listed[0])) if listed else np.linspace(-largest, largest, self.actions)
         return LookAhead(self.task, grid.value, tried)
+
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData | None:
+        """Return the table's data; None if it looks ahead on an undisturbed environment that no page has."""
+        if self.task.imperfections:
+            return None
+        about = {
+            "kind": f"{self.kind} table",
+            "sums": self.sums.tolist(),
+            "axes": self.axes,
+            "mirror": self.mirror,
+            "sign": self.sign,
+            "actions": self.actions,
+            "read": self.agent(arrays).read.numbers(),
+            "interval": self.task.interval,
+        }
+        return PageData(about, arrays, self.head)
 
 
 class _GridValues:

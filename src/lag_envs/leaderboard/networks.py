@@ -14,10 +14,11 @@ from pydantic import Field, model_validator
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import (
     POLICY,
-    Agent,
     Architecture,
     Array,
     Head,
+    Memoryless,
+    PageData,
     PolicyTable,
     Remembering,
 )
@@ -148,14 +149,32 @@ class Network(Architecture):
         if self.normalise:
             self.arrays |= {"obs_mean": (wide,), "obs_var": (wide,)}
 
-    def agent(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+    def agent(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         """Return the network."""
         if self.normalise and (arrays["obs_var"] < 0.0).any():
             raise Refused("obs_var must not be below 0")
         return self._made(arrays)
 
     @abstractmethod
-    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering: ...
+    def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering: ...
+
+    @property
+    @abstractmethod
+    def _kind(self) -> dict[str, Any]:
+        """The kind of network, and the numbers of this kind, for a page."""
+
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData:
+        """Return the network's data."""
+        about = {
+            "layers": self.layers,
+            "activation": self.activation,
+            "bins": self.bins,
+            "controls": self.controls,
+            "squash": self.squash,
+            "mean_limit": self.mean_limit,
+            "normalise": self.normalise and self.normalise.model_dump(),
+        }
+        return PageData(about | self._kind, arrays, self.head)
 
 
 class MLP(Network):
@@ -187,9 +206,13 @@ class MLP(Network):
         self.arrays = {}
         self._layers(task, table, wide, wide)
 
-    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+    def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         layers = _Layers(self, arrays)
         return _Feedforward(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
+
+    @property
+    def _kind(self) -> dict[str, Any]:
+        return {"kind": "mlp", "frames": self.frames, "padding": self.padding}
 
 
 class GRU(Network):
@@ -217,8 +240,12 @@ class GRU(Network):
         self.arrays |= {"weight_hh": (tall, self.memory), "bias_hh": (tall,)}
         self._layers(task, table, wide, self.memory)
 
-    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+    def _made(self, arrays: Mapping[str, Array]) -> Memoryless | Remembering:
         return _Recurrent(_Layers(self, arrays), arrays)
+
+    @property
+    def _kind(self) -> dict[str, Any]:
+        return {"kind": "gru", "memory": self.memory}
 
 
 class _Layers:
@@ -266,7 +293,7 @@ class _Layers:
         return self.head.largest * np.tanh(x) if self.made.squash == "tanh" else x
 
 
-class _Feedforward(Agent):
+class _Feedforward(Memoryless):
     def __init__(self, layers: _Layers) -> None:
         super().__init__(layers.head)
         self.layers = layers
@@ -336,8 +363,12 @@ class Linear(Architecture):
         """Return the feedback."""
         return _LinearFeedback(self.head, arrays["gain"], arrays["offset"])
 
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData:
+        """Return the arrays, which say everything."""
+        return PageData({"kind": "linear"}, arrays, self.head)
 
-class _LinearFeedback(Agent):
+
+class _LinearFeedback(Memoryless):
     def __init__(self, head: Head, gain: Array, offset: Array) -> None:
         super().__init__(head)
         self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))

@@ -29,7 +29,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, create_model
 
-from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
+from lag_envs.leaderboard.architecture import (
+    POLICY,
+    Architecture,
+    Array,
+    PageData,
+    PolicyTable,
+    feedback_data,
+)
 from lag_envs.leaderboard.fields import Strict, accepted, between, shown_ascii
 from lag_envs.leaderboard.grids import GridArchitecture
 from lag_envs.leaderboard.networks import GRU, MLP, Linear
@@ -126,6 +133,10 @@ class ControllerPolicy(Architecture):
         except Exception as error:  # nonsensical numbers may raise anything
             reason = shown_ascii(f"{type(error).__name__}: {error}")
             raise Refused(f"the controller cannot be made with these numbers: {reason}") from error
+
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData | None:
+        """Return the controller as feedback; None if it is not pure feedback, or plans."""
+        return None if self.plans else feedback_data(self.agent(arrays), self.task)
 
 
 ARCHITECTURES: dict[str, type[Architecture]] = {

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from lag_envs.controllers.tracking import Tracking
-from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
+from lag_envs.leaderboard.architecture import (
+    POLICY,
+    Architecture,
+    Array,
+    PageData,
+    PolicyTable,
+    feedback_data,
+)
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
 
@@ -31,6 +37,10 @@ class PlanArchitecture(Architecture):
             raise Refused(f"{POLICY}: plans are for actions in a range, and one target at most")
         self.arrays = Tracking.shapes(task)
 
-    def agent(self, arrays: Mapping[str, Array]) -> Any:
+    def agent(self, arrays: Mapping[str, Array]) -> Tracking:
         """Return the agent that follows the plan."""
         return Tracking(self.task, **arrays)
+
+    def page_data(self, arrays: Mapping[str, Array]) -> PageData | None:
+        """Return the plan as feedback."""
+        return feedback_data(self.agent(arrays), self.task)

@@ -180,9 +180,10 @@ def record_again(
     training_seed, data = submission.policies[policy]
     first = protocol.first_seed(result["digest"], result["nonce"], policy)
     agent = data.agent()
-    # Random actions are drawn for all episodes together, so all have to be played.
-    rows = list(chosen) if hasattr(agent, "rng") else list(range(len(chosen)))
-    seeds = range(first, first + result["episodes"]) if hasattr(agent, "rng") else [first + i for i in chosen]
+    if agent.random:  # all episodes have to be played
+        rows, seeds = list(chosen), list(range(first, first + result["episodes"]))
+    else:
+        rows, seeds = list(range(len(chosen))), [first + i for i in chosen]
     rollout = Rollout(env, agent, seeds)
     outcome = Outcome(rollout)
     played = record_rollout(rollout, outcome)

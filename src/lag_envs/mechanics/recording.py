@@ -266,7 +266,7 @@ def single_expression(value: Any, what: str = "") -> Expr:
     if value is None:
         raise FormulaError(f"{what}returns None; end it with a return of a number")
     if getattr(value, "ndim", 0) or isinstance(value, tuple | list | set | dict):
-        raise FormulaError(f"{what}returns {type(value).__name__} where one number is wanted")
+        raise FormulaError(f"{what}returns {type(value).__name__} where one number is expected")
     if isinstance(value, complex):
         raise FormulaError(f"{what}returns the complex number {value}; formulas are real")
     try:

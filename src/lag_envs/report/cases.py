@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
+
+
+def _smaller_than_its_shell(drawn: dict[str, float]) -> None:
+    if drawn["radius"] >= drawn["shell_radius"]:
+        drawn["radius"] = 0.5 * drawn["shell_radius"]
 
 
 class Variant(NamedTuple):
@@ -25,6 +30,7 @@ class Variant(NamedTuple):
     start: tuple[float, ...]  #: of the stability maps; float32 holds its entries exactly
     control: float  #: of the stability maps
     typical: bool = False  #: whether libraries that are slow to compile or to run are measured on it too
+    adjust: Callable[[dict[str, float]], None] = lambda drawn: None  #: makes drawn parameters fit together
 
     def scene(self, **changes: Any) -> Scene:
         """Return the scene, with other parameters if given."""
@@ -41,9 +47,9 @@ VARIANTS = {
         Variant("Incline, moving", Incline, {"damping": 0.03, "control": "tilt_rate"}, 0.05,
                 (0.5, 1, 0.1), (-0.3, 0.3), (0.25, 1.0, 0.125), 0.25, typical=True),
         Variant("CylinderInCylinder, drag", CylinderInCylinder, {"control": "damping"}, 0.02,
-                (1.3, 5), (0, 2.4), (1.0, 3.0), 0.0),
+                (1.3, 5), (0, 2.4), (1.0, 3.0), 0.0, adjust=_smaller_than_its_shell),
         Variant("CylinderInCylinder, tilt", CylinderInCylinder, {"damping": 0.024}, 0.05,
-                (1.3, 5, 6), (-15, 15), (1.0, 3.0, 1.0), 3.0, typical=True),
+                (1.3, 5, 6), (-15, 15), (1.0, 3.0, 1.0), 3.0, typical=True, adjust=_smaller_than_its_shell),
     )
 }  # fmt: skip
 #: The variant of quick reports, and of measurements that are made on a single one.
@@ -89,8 +95,8 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
             value = getattr(base, field.name)
             if vary and "unit" in field.metadata and value and field.name != "inertia":
                 changes[field.name] = value * 2.0 ** float(rng.uniform(-1, 1))
-        if changes.get("radius", 0.0) >= changes.get("shell_radius", math.inf):
-            changes["radius"] = 0.5 * changes["shell_radius"]
+        if changes:
+            variant.adjust(changes)
         cases.append(Case(variant.scene(**changes), state, control))
     return cases
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from lag_envs.report.content import Claim, Content, ReportFigure, Table
 from lag_envs.report.episodes import DIGITS, TIMES
+from lag_envs.report.gymnasium_peers import PEERS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.scenes.derivation import form_of
 from lag_envs.stepping.series import TOLERANCE
@@ -28,8 +29,6 @@ APART = 1e9  #: Factor by which Gymnasium's errors should at least exceed those 
 RELEASED, COMPARED, LONG = 2.5, 10.0, 100.0
 MARKS = ("one step", *(f"{t:g} s" for t in TIMES), "the end")
 BLUE, GREY = "#0072b2", "#666666"
-#: Colours of Okabe and Ito.
-COLOURS = {"Pendulum-v1": "#d55e00", "CartPole-v1": "#cc79a7", "Acrobot-v1": "#009e73"}
 
 
 def content(rows: list[Row], problems: list[JobResult]) -> Content:
@@ -299,7 +298,7 @@ def _angle(row: Row) -> float:
 
 
 def _colour(row: Row) -> str:
-    return BLUE if row["own"] else COLOURS[row["case"].partition(",")[0]]
+    return BLUE if row["own"] else PEERS[row["case"].partition(",")[0]].colour
 
 
 def _curve(row: Row) -> tuple[list[float], list[float], list[float]]:

@@ -57,13 +57,13 @@ def jobs(quick: bool) -> list[ReportJob]:
     ]
     made += [
         ReportJob(peer_episode, f"{id}, seed {seed}", {"id": id, "seed": seed, "seconds": seconds})
-        for id in PEERS
-        for seed in (seeds[:3] if id == "Acrobot-v1" else seeds)  # its episodes last 100 s
+        for id, peer in PEERS.items()
+        for seed in seeds[: peer.seeds]
     ]
     free: dict[str, dict[str, Any]] = {"lag_envs, undriven": {"id": ""}}
     if not quick:
         free["lag_envs, undriven, dt 0.02 s"] = {"id": "", "dt": 0.02}
-    free |= {f"{id}, undriven": {"id": id} for id in UNDRIVEN}
+    free |= {f"{id}, undriven": {"id": id} for id, peer in PEERS.items() if peer.undriven}
     return made + [ReportJob(undriven, name, given) for name, given in free.items()]
 
 
@@ -86,7 +86,7 @@ def own_episode(id: str, seed: int, duration: float | None = None) -> Iterator[R
 
 
 def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool = False) -> Row:
-    """Return the row of an episode of lag_envs; if requested, computed twice, with the difference."""
+    """Return the row of an episode of lag_envs; `vouch` adds how far two exact computations differ."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
         return chained(exact_stepping(task, seed, digits), [mpf(x) for x in start], episode.controls)
@@ -108,28 +108,17 @@ def against_exact(task: Task, episode: RecordedEpisode, seed: int, vouch: bool =
 
 
 def peer_episode(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
-    """Yield rows of one of Gymnasium's environments under random actions.
-
-    CartPole-v1 falls within half a second. A second row continues to 10 s, by the environment's own update,
-    as if the episode had not ended.
-    """
-    seconds = seconds or {"Acrobot-v1": 100.0}.get(id, 10.0)
-    steps = round(seconds / PEERS[id].step(gym.make(id, disable_env_checker=True).unwrapped))
-    cases = {id: True}
-    if id == "CartPole-v1":
-        cases["CartPole-v1, past its end"] = False
+    """Yield rows of one of Gymnasium's environments under random actions, as `GymnasiumPeer` describes."""
+    peer = PEERS[id]
+    steps = round((seconds or peer.seconds) / peer.step(gym.make(id, disable_env_checker=True).unwrapped))
+    cases = {id: True} | ({f"{id}, past its end": False} if peer.continued else {})
     for case, to_the_end in cases.items():
         env, episode, used = random_episode(id, seed, steps, to_the_end)
-        yield measure_peer(env, PEERS[id], episode) | {"case": case, "seed": used}
+        yield measure_peer(env, peer, episode) | {"case": case, "seed": used}
 
 
 # --- the undriven pendulum ---
 
-#: Peers, a change that removes their force, and the action to take.
-UNDRIVEN: dict[str, tuple[dict[str, float], Any]] = {
-    "Pendulum-v1": ({}, np.zeros(1, np.float32)),
-    "CartPole-v1": ({"force_mag": 0.0}, 0),
-}
 #: Makes an environment of lag_envs with Pendulum-v1's equation of motion: a rod of 1 m and 1 kg.
 TWIN: dict[str, Any] = {
     "mass": 1.0,
@@ -156,7 +145,9 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
         energy = scene.energy(episode.states)["total"] - scene.energy([0.0, 0.0])["total"]
         case = f"{SwingUpFree.id} with Pendulum-v1's equation, undriven"
     else:
-        peer, (changes, action) = PEERS[id], UNDRIVEN[id]
+        peer = PEERS[id]
+        assert peer.undriven
+        changes, action = peer.undriven
         env = gym.make(id, disable_env_checker=True).unwrapped
         env.reset(seed=0)
         vars(env).update(changes)

@@ -137,8 +137,7 @@ class FixedSlopeEquation(FlowEquation):
 
     def problem(self, k: Any, variables: Sequence, xp: Any, carried: bool) -> Problem:
         """Return the equation of motion."""
-        pull = k.acceleration
-        return Problem(lambda q, t: pull, lambda q, t: 0.0, k.damping_rate, True)
+        return Problem(lambda q, t: k.acceleration, lambda q, t: 0.0, k.damping_rate, True)
 
     def turned(self, k: Any, variables: Sequence, q: Any, dt: Any, xp: Any, carried: bool) -> Sequence:
         """Return nothing: the flow has no cosine and sine."""

@@ -1,4 +1,4 @@
-"""Scenes defined by energies alone: error against time compared with other engines, certificates, energy.
+"""Scenes defined by energies alone: work-precision compared with other engines, certificates, energy.
 
 Each system takes one control step from the same harsh states, with every joint turning fast at once. All
 rivals run in compiled loops, with many states in one call, and the errors are those of the timed calls. Other
@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from lag_envs.report.general_results import CERTIFIED_ORDERS, DT, MEMBERS, content
-from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
+from lag_envs.report.linkage_rivals import ENGINES, differences
+from lag_envs.report.linkages import SYSTEMS, System
 from lag_envs.report.motions import Array, CertifiedSeries, SceneProblems
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.points import MODES
@@ -129,7 +130,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
         yield about | {"mass": mass, "acceleration": acceleration}
 
 
-# --- error against time ---
+# --- work-precision ---
 
 
 def system_rivals(family: str, quick: bool) -> list[Rival]:

@@ -36,6 +36,11 @@ class GymnasiumPeer(NamedTuple):
     integrator: str
     step: Callable[[Any], float]  #: the control step [s] from an instance
     control: Callable[[Any, Any], float]  #: from an instance and an action, like the environment's own code
+    colour: str  #: one of Okabe and Ito's
+    seconds: float = 10.0  #: length of the episodes [s]
+    seeds: int | None = None  #: how many episodes at most
+    continued: bool = False  #: whether episodes are also continued past their end, by its own update
+    undriven: tuple[dict[str, float], Any] | None = None  #: changes that remove the force; the action to take
     wraps: Sequence[int] = ()
     limits: Callable[[Any], Sequence[float]] = lambda env: ()  #: at these speeds it clips the last entries
 
@@ -52,6 +57,8 @@ PEERS = {
         "semi-implicit Euler",
         lambda env: env.dt,
         lambda env, action: float(np.clip(action, -env.max_torque, env.max_torque)[0]),
+        "#d55e00",
+        undriven=({}, np.zeros(1, np.float32)),
         limits=lambda env: [env.max_speed],
     ),
     "CartPole-v1": GymnasiumPeer(
@@ -62,6 +69,9 @@ PEERS = {
         "explicit Euler",
         lambda env: env.tau,
         lambda env, action: env.force_mag if action == 1 else -env.force_mag,
+        "#cc79a7",
+        continued=True,  # it falls within half a second
+        undriven=({"force_mag": 0.0}, 0),
     ),
     "Acrobot-v1": GymnasiumPeer(
         lambda env: Acrobot(
@@ -73,6 +83,9 @@ PEERS = {
         "RK4",
         lambda env: env.dt,
         lambda env, action: float(env.AVAIL_TORQUE[action]),
+        "#009e73",
+        seconds=100.0,
+        seeds=3,
         wraps=(0, 1),
         limits=lambda env: [env.MAX_VEL_1, env.MAX_VEL_2],
     ),

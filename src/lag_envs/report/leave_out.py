@@ -171,7 +171,7 @@ def savings(count: int, rounds: int) -> Iterator[Row]:
 TEXT = (
     "A constant that is zero costs no operation, and the state has no entries that an environment "
     "does not need. Terms are those of θ'' = -α sinθ - β cosθ - γθ' + δ + ramp·t for bar and shell, of "
-    "x'' = pull - drag·x' for a fixed slope, and of the linear equation of a turning slope.",
+    "x'' = acceleration - damping_rate·x' for a fixed slope, and of the linear equation of a turning slope.",
     "Unused inputs of an id's compiled step are those on which no result depends. To find them, the step's "
     "lines are followed backwards from the next state, reward, ending and observation to constants, state, "
     "target and action. Idle operations are those whose result is not used.",

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from lag_envs.mechanics.algebra import Atom, Expr, evaluate, substitute
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter, parameter_values
 from lag_envs.report.equations import Equation, Problems
+from lag_envs.report.linkages import System
 from lag_envs.report.oracle import oracle_of, solve_positive
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import BLOCK, Sample, blocks, unblocked
@@ -22,9 +23,6 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.stepping.compiling import compile_lines
 from lag_envs.stepping.general import series_code_of
-
-if TYPE_CHECKING:
-    from lag_envs.report.linkages import System
 
 Array = NDArray[np.float64]
 

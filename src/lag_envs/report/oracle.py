@@ -274,7 +274,7 @@ class Oracle:
     --------
     >>> from lag_envs.scenes import PivotedBar
     >>> oracle = Oracle(PivotedBar(gravity=0.0, track=None))
-    >>> [float(x) for x in oracle.flow((2.0, 3.0), 0.0, 0.5)]
+    >>> [float(x) for x in oracle.once((2.0, 3.0), 0.0, 0.5, digits=30)]
     [3.5, 3.0]
     """
 
@@ -361,8 +361,8 @@ class Oracle:
 
     # --- exact ---
 
-    def flow(self, state: Sequence, controls: Any, dt: Any, digits: int = 30) -> list[mpf]:
-        """Return the state after a time dt with the controls held.
+    def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
+        """Return the state after a time dt with the controls held, from one computation; see `agreed`.
 
         Parameters
         ----------
@@ -372,26 +372,16 @@ class Oracle:
             The control, or the controls.
         dt : float or mpf
             The time [s], which may be much longer than a control step.
-        digits : int, default 30
-            Number of requested decimal digits.
-
-        Returns
-        -------
-        list of mpf
-            The entries; two computations of them agree to 10**-digits times max(1, abs(entry)).
+        digits : int
+            Number of decimal digits that the steps keep.
 
         Raises
         ------
         Unresolved
-            If the computations do not agree even with four times the digits, or if the motion needs too many
-            steps.
+            If the motion comes to a singular point, or needs too many steps.
         ValueError
             If the state or the controls do not have the scene's length.
         """
-        return agreed(lambda working: self.once(state, controls, dt, working), digits)
-
-    def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
-        """Return the end state from one computation whose steps keep this many digits."""
         for what, given, names in (
             ("state", state, self.names.state),
             ("controls", control_list(controls), self.names.controls),
@@ -457,7 +447,7 @@ class Oracle:
         Parameters
         ----------
         state, controls
-            As in `flow`.
+            As in `once`.
         h : float or mpf
             The unit of time [s].
         count : int

@@ -1,4 +1,4 @@
-"""The first picture of docs/accuracy.md: error against run time, of lag_envs and of its rivals.
+"""The first picture of docs/accuracy.md: a work-precision diagram of lag_envs and its rivals.
 
 It is drawn from ``docs/accuracy.json`` alone, so it can be redrawn without measuring.
 """

@@ -152,7 +152,7 @@ def _of_scene(label: str, scene: Scene) -> Subject:
 
 
 def subject(file: str, name: str) -> Subject:
-    """Return the subject with a name, in a process that measures."""
+    """Return a file's subject by its name, which is all that a measuring process is given."""
     return next(s for s in subjects(file) if s.name == name)
 
 

@@ -35,11 +35,8 @@ class LibraryRival(Rival):
     settings: ClassVar[dict[str, Sequence[float]]]
     #: Whether it is slow to compile or to run, and so is measured on typical variants only.
     slow: ClassVar[bool] = False
-
-    @classmethod
-    def solves(cls, scene: Scene) -> bool:
-        """Return whether the rival can step a scene."""
-        return True
+    #: The kind of scenes that it can step.
+    scenes: ClassVar[type[Scene]] = Scene
 
     def __init__(self, method: str, setting: float) -> None:
         super().__init__(method, setting)
@@ -439,16 +436,12 @@ class MuJoCo(LibraryRival):
     family = "mujoco"
     settings: ClassVar = {"Euler": SUBSTEPS, "implicitfast": SUBSTEPS, "RK4": SUBSTEPS}
     fixed, batched = True, False  # a rollout takes one state after the other
-
-    @classmethod
-    def solves(cls, scene: Scene) -> bool:
-        """Return whether MuJoCo has a model of the scene."""
-        return isinstance(scene, PivotedBar)
+    scenes = PivotedBar  # whose model is `BAR`
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Make a model of every problem."""
         scene = problems.cases[0].scene
-        if not self.solves(scene):
+        if not isinstance(scene, self.scenes):
             raise ValueError(f"there is no MuJoCo model of {type(scene).__name__}")
         import mujoco
         from mujoco.rollout import rollout

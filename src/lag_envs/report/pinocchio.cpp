@@ -1,4 +1,4 @@
-// Motions of chains of links by Pinocchio, one state after the other, in RK4 steps. linkages.py compiles and calls it.
+// Motions of chains of links by Pinocchio, one state after the other, in RK4 steps. linkage_rivals.py compiles and calls it.
 #include <pinocchio/multibody.hpp>
 #include <pinocchio/algorithm/aba.hpp>
 #include <pinocchio/algorithm/crba.hpp>

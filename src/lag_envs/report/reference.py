@@ -38,8 +38,8 @@ def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: i
 def exact_flow(scene: Scene, state: Sequence[Any], controls: Any, dt: Any, digits: int = 30) -> list[mpf]:
     """Return the state after a time dt with the controls held.
 
-    The state is computed by the oracle, see `Oracle.flow`, or by the closed form for undamped pendulums that
-    move far.
+    The state is computed by the oracle, see `Oracle.once`, or by the closed form for undamped pendulums that
+    move far. Two computations of an entry agree to 10**-digits times max(1, abs(entry)).
     """
     oracle = oracle_of(scene)
     return agreed(lambda working: once(oracle, state, controls, dt, working), digits)

@@ -12,7 +12,8 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.derivation import form_of, motion_constants_of
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.compiling import absent_from
-from lag_envs.stepping.flows import Flow, FlowCode
+from lag_envs.stepping.flow_code import FlowCode
+from lag_envs.stepping.flows import Flow
 
 
 class Stepped:

@@ -327,7 +327,7 @@ class Scene(metaclass=SceneType):
 
         The forces in `reactions` have the names given there. The force on any other coordinate s whose
         acceleration or rate is a control is ``drive_s``. For a coordinate at rest, or held at a place by a
-        control, only forces named in `reactions` are returned. A ratio |F|/N is infinite if N is not above
+        control, only forces named in `reactions` are returned. A ratio |F|/N is infinite if N is at most
         1e-12 of the weight: the contact carries no load, or pulls.
 
         Parameters

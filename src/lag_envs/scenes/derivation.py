@@ -134,5 +134,8 @@ def code_of(scene: Scene, dt: float, lagged: bool = False) -> Any:
     from lag_envs.stepping.compiling import absent_from
 
     absent = absent_from(motion_constants_of(scene, lagged))
-    form = None if lagged else form_of(scene)
-    return form.code(dt, absent) if form else _form_or_series(scene, lagged).code(absent)
+    if not lagged and (form := form_of(scene)):
+        from lag_envs.stepping.flow_code import flow_code
+
+        return flow_code(form, dt, absent)
+    return _form_or_series(scene, lagged).code(absent)

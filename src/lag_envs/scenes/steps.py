@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +43,7 @@ from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
     from lag_envs.stepping.general import StepBound
+    from lag_envs.stepping.tangent import FlowTangent, SeriesTangent
 
 Array = NDArray[np.float64]
 
@@ -268,43 +270,24 @@ def _check_refused(
         )
 
 
-class _Derivatives(NamedTuple):
-    """Derivatives of steps by rows: ``jacobian(states, controls, dt)``, ``vjp(..., cotangents)``.
-
-    `rates` has those of the normal form's constants with respect to the parameters, if there is such a form.
-    """
-
-    jacobian: Callable[[Array, Array, float], tuple[Any, int]]
-    vjp: Callable[[Array, Array, float, Array], tuple[Any, int]]
-    rates: Mapping[str, Sequence[float]]
-
-
-def derivatives_of(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
+def derivatives_of(scene: Scene, by: tuple[str, ...]) -> FlowTangent | SeriesTangent:
     """Return the derivatives of steps with respect to states, controls and parameters."""
     known = vars(scene).setdefault("_cached_derivatives", {})
     if by in known:
         return known[by]
     from lag_envs.stepping.general import stepper_of
     from lag_envs.stepping.normal_forms import normal_form
+    from lag_envs.stepping.tangent import FlowTangent, SeriesTangent
 
     motion_constants_of(scene)  # for its errors
     mechanics = mechanics_with(scene, by)
     form, parameters = normal_form(mechanics, chosen_order_of(scene)), parameter_values(scene)
     try:
-        if form:
-            constants, rates = form.constants(parameters), form.rates(parameters, by)
-            known[by] = _Derivatives(
-                lambda y, u, dt: form.jacobian(y, u, constants, dt, rates, len(by)),
-                lambda y, u, dt, seeds: form.vjp(y, u, constants, dt, seeds, rates, len(by)),
-                rates,
-            )
-        else:
-            tangent = stepper_of(mechanics).tangent(parameters, by)
-            known[by] = _Derivatives(
-                lambda y, u, dt: tangent.jacobian(y, u, dt, series_order_of(scene, dt)),
-                lambda y, u, dt, seeds: tangent.vjp(y, u, dt, series_order_of(scene, dt), seeds),
-                {},
-            )
+        known[by] = (
+            FlowTangent(form, parameters, by)
+            if form
+            else SeriesTangent(stepper_of(mechanics), parameters, by, partial(series_order_of, scene))
+        )
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={parameters[name]:g}" for name in by)
         raise ValueError(

@@ -22,7 +22,8 @@ from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, Node, SeriesRecord
 from lag_envs.stepping.matrices import matrix_times
-from lag_envs.stepping.series import STRIDE, ExpansionStart, Factor, Series, StepProgress, evenly, following
+from lag_envs.stepping.series import STRIDE, Series, StepProgress, evenly, following
+from lag_envs.stepping.slots import ExpansionStart, Factor
 from lag_envs.stepping.target import Target
 
 

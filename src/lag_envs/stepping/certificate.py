@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lag_envs.stepping.lowering import Node
 from lag_envs.stepping.matrices import matrix_times
+from lag_envs.stepping.slots import ExpansionStart, Factor, SeriesSlots
 from lag_envs.stepping.target import Target
-
-if TYPE_CHECKING:
-    from lag_envs.stepping.series import ExpansionStart, Factor, Series
 
 #: Smaller sizes are replaced by this one; its unit is √(kg m²) m/s, or whatever follows from those of the
 #: mass matrix.
@@ -44,7 +42,7 @@ class Certificate:
     """
 
     def __init__(
-        self, series: Series, t: Target, start: ExpansionStart, h: Any, order: Any, tolerance: Any
+        self, series: SeriesSlots, t: Target, start: ExpansionStart, h: Any, order: Any, tolerance: Any
     ) -> None:
         self._series, self._t, self._order, self._tolerance = series, t, order, tolerance
         self._start, self._n, self._whole = start, series.size, h

@@ -9,8 +9,9 @@ import hashlib
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from itertools import islice
 from typing import Any
 
 from lag_envs.stepping.tracing import Trace, Value
@@ -54,6 +55,52 @@ def block_lines(trace: Trace, outputs: dict[str, Any], *, fused: bool = True) ->
     """Return the code of `record_block`, with outputs that turned out to be constant assigned as well."""
     lines, values = record_block(trace, outputs, fused=fused)
     return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
+
+
+def section(
+    formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], kind: type[Trace] = Trace
+) -> tuple[list[str], list]:
+    """Record ``formula(xp, *inputs)``.
+
+    Parameters
+    ----------
+    formula : callable
+        Returns one number per output.
+    inputs : sequence of str or float
+        A string names an input; a float is a constant.
+    outputs : sequence of str
+        Names for the results.
+    kind : type
+        The kind of recording, which decides how functions are recorded.
+
+    Returns
+    -------
+    lines : list of str
+        The code.
+    values : list of str or float
+        For each output, its name, or its value if it turned out to be constant.
+    """
+    trace = kind()
+    results = formula(trace, *(_input(trace, i) for i in inputs))
+    return record_block(trace, dict(zip(outputs, results, strict=True)))
+
+
+def _input(trace: Trace, value: Any) -> Any:
+    if isinstance(value, str):
+        return trace.inputs(value)[0]
+    return trace.zero() if value == 0.0 else value
+
+
+def split_lengths(values: Sequence, *sizes: int) -> list[list]:
+    """Cut a sequence into lists of the given lengths; the rest forms the last.
+
+    Examples
+    --------
+    >>> split_lengths([1, 2, 3, 4], 1, 2)
+    [[1], [2, 3], [4]]
+    """
+    rest = iter(values)
+    return [*(list(islice(rest, n)) for n in sizes), list(rest)]
 
 
 def count_operations(lines: Iterable[str], kinds: frozenset[str] | None = None) -> int:

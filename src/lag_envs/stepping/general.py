@@ -26,7 +26,6 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.rows import Rows
 from lag_envs.stepping.series import TOLERANCE
-from lag_envs.stepping.tangent import SeriesTangent
 
 
 class SeriesStepper:
@@ -181,8 +180,13 @@ class SeriesStepper:
 
     # --- derivatives ---------------------------------------------------------------------------------------
 
-    def tangent(self, parameters: Mapping[str, float], by: tuple[str, ...] = ()) -> SeriesTangent:
-        """Return the step of a scene with these parameters, differentiated with respect to those in `by`."""
+    def tangent_record(
+        self, parameters: Mapping[str, float], by: tuple[str, ...]
+    ) -> tuple[SeriesRecord, dict[str, float], dict[str, float]]:
+        """Return the step's record with tangents with respect to the parameters in `by` too.
+
+        Its constants with these parameters are returned with it, and the parameters that `prepare` takes.
+        """
         if by not in self._tangents:
             self._tangents[by] = self._lowered(tangents=by)
         lowering, parts = self._tangents[by]
@@ -193,8 +197,7 @@ class SeriesStepper:
             slopes = _evaluated({n: derivative(e, parameter(p)) for n, e in exprs.items()}, parameters)
             lifted |= {name for name in exprs if slopes[name] != 0.0}
         numbers = {f"p_{name}": float(parameters[name]) for name in self._parameters}
-        record = lowering.without(*parts, frozenset(exprs) - lifted)
-        return SeriesTangent(self, record, constants, numbers, by)
+        return lowering.without(*parts, frozenset(exprs) - lifted), constants, numbers
 
     # --- code -----------------------------------------------------------------------------------------------
 

@@ -24,6 +24,7 @@ from lag_envs.stepping import (
     matrices,
     primitives,
     series,
+    slots,
     target,
     tracing,
 )
@@ -287,7 +288,7 @@ def _version() -> str:
     """Return a digest of all that decides what is printed: this code, registers, and the length of rows."""
     modules = (
         *(algebra, backward, certificate, dual, elementary, lowering, matrices, primitives),
-        *(series, target, tracing),
+        *(series, slots, target, tracing),
     )
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]

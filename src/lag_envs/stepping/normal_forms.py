@@ -16,7 +16,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from functools import cache
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
@@ -30,8 +29,7 @@ from lag_envs.mechanics.layout import SceneLayout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.compiling import absent_from
-from lag_envs.stepping.flows import SLIDE, TURN, Flow, FlowCode, pendulum_flow
+from lag_envs.stepping.flows import SLIDE, TURN, Flow, pendulum_flow
 from lag_envs.stepping.general import StepBound
 from lag_envs.stepping.tracing import Trace
 
@@ -172,72 +170,6 @@ class NormalForm:
                 found[name].append(_float(rate - x * first / inertia, inertia))
         return {name: row for name, row in found.items() if any(row)}
 
-    def jacobian(
-        self,
-        states: Any,
-        controls: Any,
-        constants: Mapping[str, float],
-        dt: float,
-        rates: Mapping[str, Sequence[float]],
-        parameters: int,
-    ) -> tuple[Any, int]:
-        """Return the derivatives of the end states with respect to states, controls and parameters.
-
-        Arguments and results are those of `SeriesTangent.jacobian`; `constants` are those of this form, and
-        `rates` their derivatives with respect to the parameters.
-        """
-        code, absent = self._code(dt, constants)
-        by = tuple(
-            name
-            for name, terms in self.terms.items()
-            if any(t.constant in rates or (t.held.number is None and t.constant not in absent) for t in terms)
-        )
-        first = states.shape[1] + controls.shape[1]
-        found = np.empty((*states.shape, first + len(rates)))
-        numbers = (constants[name.removeprefix("k_")] for name in code.constants)
-        jacobian = code.compile_jacobian(by, tuple(rates))
-        refused = jacobian(states, controls, found, dt, self.largest_majorant(dt), *numbers)
-        if not refused and not np.isfinite(found).all():
-            refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
-        if parameters:
-            by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
-            found = np.concatenate([found[..., :first], found[..., first:] @ by_constants], axis=-1)
-        return found, refused
-
-    def vjp(
-        self,
-        states: Any,
-        controls: Any,
-        constants: Mapping[str, float],
-        dt: float,
-        cotangents: Any,
-        rates: Mapping[str, Sequence[float]],
-        parameters: int,
-    ) -> tuple[Any, int]:
-        """Return gradients with respect to states, controls and parameters from those of the end states.
-
-        The other arguments are those of `jacobian`, which is used if a step is not ordinary.
-        """
-        code, _ = self._code(dt, constants)
-        numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
-        slopes, by_rates, ordinary = code.vjp(tuple(rates))(numbers, states, controls, cotangents)
-        if parameters:
-            by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
-            slopes = np.concatenate([slopes, by_rates @ by_constants], axis=1)
-        (others,) = np.nonzero(ordinary[:, 0] == 0.0)
-        if len(others):
-            some = np.ascontiguousarray(states[others]), np.ascontiguousarray(controls[others])
-            jacobian, refused = self.jacobian(*some, constants, dt, rates, parameters)
-            if refused:
-                return slopes, int(others[refused - 1]) + 1
-            slopes[others] = np.einsum("ni,nij->nj", cotangents[others], jacobian)
-        return slopes, 0
-
-    def _code(self, dt: float, constants: Mapping[str, float]) -> tuple[FlowCode, frozenset[str]]:
-        """Return the code of a step with these constants, and the names of those that are zero."""
-        absent = absent_from(constants)
-        return self.code(dt, absent), absent
-
     # --- what depends on numbers ---------------------------------------------------------------------------
 
     def coefficients(self, state: ArrayLike, controls: Sequence, constants: Mapping[str, float]) -> Any:
@@ -265,20 +197,11 @@ class NormalForm:
         """Return the step's bounds, known before it is taken; see `Scene.step_bound`."""
         return StepBound(1, 0, dict.fromkeys(self.state_names, 0.0), "stepped to rounding")
 
-    def code(self, dt: float, absent: frozenset[str] = frozenset()) -> FlowCode:
-        """Return the code of a control step; constants that are zero leave no code."""
-        return _flow_code(self, self.flow(dt), absent)
-
 
 def lifted(form: NormalForm | None, y: Any, xp: Any) -> list:
     """Return a state's entries, followed by cosine and sine of the angle if the scene's form has one."""
     angle = None if form is None else form.angle
     return [*y] if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
-
-
-@cache
-def _flow_code(form: NormalForm, flow: Flow, absent: frozenset[str]) -> FlowCode:
-    return FlowCode(form, flow, absent)
 
 
 class DrivenPendulum(NormalForm):

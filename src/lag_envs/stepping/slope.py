@@ -174,9 +174,9 @@ def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-d
         dt * (acceleration * dt * slope1 - v * decay),
     )
     for j in range(slopes.shape[1]):
-        dv, d_pull, d_drag = slopes[1, j], slopes[2, j], slopes[3, j]
-        slopes[0, j] += dt * (dv * phi1 + d_pull * dt * phi2) + far * d_drag
-        slopes[1, j] = dv * decay + d_pull * dt * phi1 + fast * d_drag
+        dv, d_acceleration, d_damping = slopes[1, j], slopes[2, j], slopes[3, j]
+        slopes[0, j] += dt * (dv * phi1 + d_acceleration * dt * phi2) + far * d_damping
+        slopes[1, j] = dv * decay + d_acceleration * dt * phi1 + fast * d_damping
     return 0
 
 

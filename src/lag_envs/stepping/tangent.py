@@ -1,22 +1,93 @@
-"""Derivatives of control steps by the general series, forwards and backwards."""
+"""Derivatives of control steps, forwards and backwards: by an exact flow, or by the general series."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import numpy as np
 
+from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
-from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.flow_code import FlowCode, flow_code
+from lag_envs.stepping.general import SeriesStepper
+from lag_envs.stepping.normal_forms import NormalForm
 
-if TYPE_CHECKING:
-    from lag_envs.stepping.general import SeriesStepper
+
+class FlowTangent:
+    """Derivatives of control steps of one scene that has a normal form.
+
+    Parameters
+    ----------
+    form : NormalForm
+        The scene's normal form.
+    parameters : mapping from str to float
+        The scene's parameters.
+    by : tuple of str
+        Parameters with respect to which derivatives are taken, besides state and controls.
+
+    Attributes
+    ----------
+    rates : mapping from str to list of float
+        Derivatives of the form's constants with respect to these parameters, without rows of 0.
+    """
+
+    def __init__(self, form: NormalForm, parameters: Mapping[str, float], by: tuple[str, ...]) -> None:
+        self._form, self._constants = form, form.constants(parameters)
+        self.rates = form.rates(parameters, by)
+        self._by_constants = np.array([*self.rates.values()]).reshape(len(self.rates), len(by))
+
+    def jacobian(self, states: Any, controls: Any, dt: float) -> tuple[Any, int]:
+        """Return the derivatives of the end states; see `SeriesTangent.jacobian`."""
+        code, absent = self._code(dt)
+        by = tuple(
+            name
+            for name, terms in self._form.terms.items()
+            if any(
+                t.constant in self.rates or (t.held.number is None and t.constant not in absent)
+                for t in terms
+            )
+        )
+        first = states.shape[1] + controls.shape[1]
+        found = np.empty((*states.shape, first + len(self.rates)))
+        numbers = (self._constants[name.removeprefix("k_")] for name in code.constants)
+        jacobian = code.compile_jacobian(by, tuple(self.rates))
+        refused = jacobian(states, controls, found, dt, self._form.largest_majorant(dt), *numbers)
+        if not refused and not np.isfinite(found).all():
+            refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
+        if self._by_constants.shape[1]:
+            found = np.concatenate([found[..., :first], found[..., first:] @ self._by_constants], axis=-1)
+        return found, refused
+
+    def vjp(self, states: Any, controls: Any, dt: float, cotangents: Any) -> tuple[Any, int]:
+        """Return gradients from those of the end states; steps that are not ordinary go through `jacobian`.
+
+        See `SeriesTangent.vjp`.
+        """
+        code, _ = self._code(dt)
+        numbers = np.array([dt, self._form.largest_majorant(dt), *self._constants.values()])
+        slopes, by_rates, ordinary = code.vjp(tuple(self.rates))(numbers, states, controls, cotangents)
+        if self._by_constants.shape[1]:
+            slopes = np.concatenate([slopes, by_rates @ self._by_constants], axis=1)
+        (others,) = np.nonzero(ordinary[:, 0] == 0.0)
+        if len(others):
+            some = np.ascontiguousarray(states[others]), np.ascontiguousarray(controls[others])
+            jacobian, refused = self.jacobian(*some, dt)
+            if refused:
+                return slopes, int(others[refused - 1]) + 1
+            slopes[others] = np.einsum("ni,nij->nj", cotangents[others], jacobian)
+        return slopes, 0
+
+    def _code(self, dt: float) -> tuple[FlowCode, frozenset[str]]:
+        """Return the code of a step, and the names of the constants that are zero."""
+        absent = absent_from(self._constants)
+        return flow_code(self._form, dt, absent), absent
 
 
 class SeriesTangent:
-    """Derivatives of control steps of one scene.
+    """Derivatives of control steps of one scene by the general series.
 
     Columns are computed only for variables that the equations contain: with respect to a coordinate that does
     not occur, the derivatives are those of a shift.
@@ -25,25 +96,27 @@ class SeriesTangent:
     ----------
     stepper : SeriesStepper
         The scene's stepper.
-    record : SeriesRecord
-        The record of the step, made with tangents.
-    constants, parameters : mapping from str to float
-        Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
+    parameters : mapping from str to float
+        The scene's parameters.
     by : tuple of str
         Parameters with respect to which derivatives are taken, besides state and controls.
+    order : callable
+        Returns the order of the series for a control step.
     """
+
+    rates: ClassVar[Mapping[str, Sequence[float]]] = MappingProxyType({})  # the series has no such constants
 
     def __init__(
         self,
         stepper: SeriesStepper,
-        record: SeriesRecord,
-        constants: Mapping[str, float],
         parameters: Mapping[str, float],
         by: tuple[str, ...],
+        order: Callable[[float], int],
     ) -> None:
         from lag_envs.stepping.machine import slots_for
 
-        self._stepper, self._parameters, self._given, self._by = stepper, parameters, record.given, by
+        record, constants, self._parameters = stepper.tangent_record(parameters, by)
+        self._stepper, self._given, self._by, self._order = stepper, record.given, by, order
         self._record = record
         n = record.size
         seen = {(node.op, node.index) for node in record.nodes}
@@ -62,7 +135,7 @@ class SeriesTangent:
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
         self._known_linear: dict[float, tuple[Any, ...]] = {}
 
-    def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
+    def jacobian(self, states: Any, controls: Any, dt: float) -> tuple[Any, int]:
         """Return the derivatives of the end states with respect to states, controls and parameters.
 
         Parameters
@@ -73,8 +146,6 @@ class SeriesTangent:
             The controls that are held.
         dt : float
             Length of the step [s].
-        order : int
-            Order of the series.
 
         Returns
         -------
@@ -97,7 +168,7 @@ class SeriesTangent:
             if name in before:
                 values[:, i] = getattr(before[name], "value", before[name])
         slopes = np.repeat(self._first[None], count, axis=0)
-        refused = self._advance(values, slopes.reshape(count, self._first.size), dt, order)
+        refused = self._advance(values, slopes.reshape(count, self._first.size), dt, self._order(dt))
         if refused:
             return None, refused
 
@@ -120,13 +191,13 @@ class SeriesTangent:
         finished = self._stepper.finish(xp, after[:size], after[size:], y, u, dt, k)
         return stacked(finished, count), 0
 
-    def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
+    def vjp(self, states: Any, controls: Any, dt: float, cotangents: Any) -> tuple[Any, int]:
         """Return gradients with respect to states, controls and parameters from those of the end states.
 
         The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
         """
         if self._stepper.mechanics.coupling:
-            found, refused = self.jacobian(states, controls, dt, order)
+            found, refused = self.jacobian(states, controls, dt)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
         linear = self._known_linear.get(dt) or self._linear(dt)
         self._known_linear = {dt: linear}  # only the latest is kept, since a scene mostly has one dt
@@ -139,13 +210,13 @@ class SeriesTangent:
         while len(rows):  # first all rows, then those whose substeps were too long for the derivatives
             before, parts = longest[some], [np.ascontiguousarray(x[:, some]) for x in (given, seeds, found)]
             shorter = before.copy()
-            self._vjp(*parts, shorter, *linear, dt, order)
+            self._vjp(*parts, shorter, *linear, dt, self._order(dt))
             given_up, too_long = rows[shorter == 0.0], rows[(0.0 < shorter) & (shorter < before)]
             found[:, some], longest[some] = parts[-1], shorter
             # In reverse mode no substep is longer than the shortest, so there may be too many substeps. In
             # forward mode substeps grow again.
             if len(given_up):
-                slopes, refused = self.jacobian(states[given_up], controls[given_up], dt, order)
+                slopes, refused = self.jacobian(states[given_up], controls[given_up], dt)
                 if refused:
                     return None, int(given_up[refused - 1]) + 1
                 found[:, given_up] = np.einsum("ni,nij->jn", cotangents[given_up], slopes)

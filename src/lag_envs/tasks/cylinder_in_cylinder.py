@@ -199,6 +199,7 @@ class Tilt(_Shell):
     )
     examples = Examples(
         start={"state": [0.3, -0.2, 1.0], "target": -0.4},
+        fast=[1.0, 100.0, 6.0],
         refused=[
             *({"state": state} for state in ([1.1, 0, 0], [0, 0, 6.1], [-1.1, 0, 0])),
             {"target": 1.2},
@@ -362,6 +363,7 @@ class Pump(_Shell):
     )
     examples = Examples(
         start={"state": [0.3, -0.2, 1.0]},
+        fast=[1.0, 100.0, 3.0],
         refused=[{"state": state} for state in ([1.4, 0, 0], [0, 0, -3.1])],
         ending=([1.299, 2.0, 0.0], 0.0),
         reach=6.0,
@@ -527,6 +529,7 @@ class Damping(Task):
     examples = Examples(
         start={"state": [0.3, -0.2]},
         moving=[3.0, 7.0],  # soon loses contact
+        fast=[0.5, 100.0],
         refused=[{"state": state} for state in ([3.0, 0.0], [2e3, 20.0])],
         ending=([2.0, 3.4], 1.0),
         reach=8.0,

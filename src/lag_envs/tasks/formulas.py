@@ -25,12 +25,12 @@ from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, 
 from lag_envs.scenes.door import is_own
 from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.flows import lift_lines
+from lag_envs.stepping.flow_code import flow_code, lift_lines
 from lag_envs.stepping.general import stepper_of
+from lag_envs.stepping.normal_forms import NormalForm
 from lag_envs.stepping.tracing import TracedNumber, is_truth
 
 if TYPE_CHECKING:
-    from lag_envs.stepping.normal_forms import NormalForm
     from lag_envs.tasks.base import Task
 
 #: Names of the formulas of a task.
@@ -237,7 +237,7 @@ class TaskFormulas:
     def step_code(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""
         if self._form:
-            return self._form.code(self._task.dt, absent)
+            return flow_code(self._form, self._task.dt, absent)
         return stepper_of(self._task.scene.mechanics).code(absent)
 
     # --- formulas -------------------------------------------------------------------------------------------

@@ -81,8 +81,7 @@ class Tilt(Task):
 
     ## Numerical Accuracy
 
-    The equation is linear while the rate is held. It is stepped by its own Taylor series, summed to rounding;
-    with `control="tilt"` by its closed form.
+    The equation is linear while the rate is held. With `control="tilt"` it has a closed form.
 
     ## Known Returns
 
@@ -137,6 +136,7 @@ class Tilt(Task):
     )
     examples = Examples(
         start={"state": [0.1, -0.2, 0.05], "target": -0.2},
+        fast=[0.4, 100.0, 0.1],
         refused=[
             *({"state": state} for state in ([0.6, 0, 0], [0, 0, 0.11], [-0.6, 0, 0])),
             {"target": 0.6},
@@ -329,8 +329,8 @@ class Brake(Task):
 
     ## Numerical Accuracy
 
-    The motion is stepped in closed form, written so that no digits cancel at any drag. The crossing time is
-    found by Newton's method on the closed form, started just below it.
+    The closed form is written so that no digits cancel at any drag. The crossing time is found by Newton's
+    method, started just below it.
 
     ## Known Returns
 
@@ -408,6 +408,7 @@ class Brake(Task):
     )
     examples = Examples(
         start={"state": [-1.5, 0.4]},
+        fast=[-1e3, 100.0],
         refused=[{"state": state} for state in ([0.1, 0.5], [0.0, 0.5], [-1.0, -0.1], [-2e3, 0])],
         ending=([-0.001, 1.0], -1.0),
         batch={

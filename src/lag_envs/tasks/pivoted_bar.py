@@ -152,6 +152,7 @@ class SwingUp(GuardedTrack, _Bar):
     )
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0]},
+        fast=[0.0, 0.0, 3.0, 100.0],
         refused=[{"state": state} for state in ([0.6, 0, 0, 0], [0.3, 1.5, 0, 0], [-0.3, -1.5, 0, 0])],
         reach=12.6,
         rest=[0.0, 0.0, math.pi, 0.0],
@@ -243,6 +244,7 @@ class SwingUpFree(SwingUp):  # noqa: D101 (SwingUp's docstring, adapted)
     examples = Examples(
         start={"state": [2.0, 3.0]},
         moving=[2.0, 30.0],
+        fast=[3.0, -100.0],
         reach=12.6,
         rest=[math.pi, 0.0],
         batch={
@@ -479,6 +481,7 @@ class Balance(_Bar):
     )
     examples = Examples(
         start={"state": [0.1, -0.2, 3.0, 0.5]},
+        fast=[0.0, 0.0, 3.0, 100.0],
         refused=[{"state": state} for state in ([0, 0, 0, 0], [0.51, 0, math.pi, 0], [0, 0, -math.pi, 0])],
         ending=([0.0, 0.0, math.pi + 0.34, 3.0], 0.0),
         reach=7.0,

@@ -20,7 +20,7 @@ class Goal:
     Parameters
     ----------
     text : str
-        Success and time, in words.
+        What counts as success, and which time is reported: "success: ...; time: ..." (or "there is no time").
     hold : float or None
         The goal must hold without a break for this many seconds at the episode's end. None: it need not hold.
     terminated : bool or None
@@ -52,13 +52,14 @@ class Controller:
     Parameters
     ----------
     place : str
-        Function that makes the controller from the task, "module:function".
+        Function that makes the controller from the task, "module:function". The controller must be a
+        `lag_envs.controllers.basic.Agent`.
     numbers : mapping
         Its keyword arguments.
     tune : mapping
         Keywords that ``python -m agents.tune`` optimises, and the range of each.
     plans : bool
-        Whether it plans for some seconds before each episode.
+        Whether it plans in each episode, which may take seconds.
     real_time : mapping, optional
         For a controller whose planning takes longer than a step: the numbers with which it acts in real time.
     """
@@ -250,6 +251,8 @@ class Examples:
         Options of a reset: a ``state`` in mid-task, and a ``target`` where there is one.
     moving : sequence of float, optional
         A faster state, for the recorded rollouts of the tests; by default the state of `start`.
+    fast : sequence of float, optional
+        A state at a large speed from which episodes work whatever the parameters, within their ranges.
     refused : sequence of mapping
         Options of resets that the task must refuse.
     ending : tuple, optional
@@ -266,6 +269,7 @@ class Examples:
 
     start: Mapping[str, Any] = field(default_factory=dict)
     moving: Sequence[float] | None = None
+    fast: Sequence[float] | None = None
     refused: Sequence[Mapping[str, Any]] = ()
     ending: tuple[Sequence[float], float] | None = None
     reach: float = 0.0

@@ -10,7 +10,7 @@ from typing import Any
 from lag_envs.envs.imperfect.draws import noise, purpose_key
 from lag_envs.envs.imperfect.rows import Ring, RowsWithRings
 from lag_envs.envs.lines import recorded_lines
-from lag_envs.stepping.flows import split_lengths
+from lag_envs.stepping.compiling import split_lengths
 from lag_envs.tasks.imperfections import Imperfections
 
 

@@ -10,14 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.controllers.basic import FeedbackLaw
 from lag_envs.envs.unfused import Unfused
-from lag_envs.leaderboard.architecture import Array, Head
-from lag_envs.leaderboard.grids import GridArchitecture
-from lag_envs.leaderboard.networks import GRU, Linear, Network
-from lag_envs.leaderboard.policies import ControllerPolicy, SubmittedPolicy
+from lag_envs.leaderboard.policies import SubmittedPolicy
 from lag_envs.leaderboard.site.scenery import page_json, picture_data
-from lag_envs.leaderboard.tracking import PlanArchitecture
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.replay import LEVELS, VERSION
@@ -215,71 +210,20 @@ def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
 def agent(policy: SubmittedPolicy) -> dict[str, Any] | None:
     """Return a policy as the page runs it, in JSON types; None for one that only Python can run.
 
-    The page runs networks, linear and time-varying feedback, and tables; of the controllers, only those that
-    are pure feedback.
-
     Parameters
     ----------
     policy : SubmittedPolicy
         The policy.
     """
-    made = policy.architecture
-    if isinstance(made, GridArchitecture) and made.task.imperfections:
-        return None  # such a policy looks ahead on the undisturbed environment, which the page does not have
-    if isinstance(made, Network | Linear | GridArchitecture):
-        about, arrays, head = _learned(policy), policy.arrays, made.head
-    elif isinstance(made, PlanArchitecture | ControllerPolicy) and not made.plans:
-        acting = policy.agent()
-        law = acting.law(made.task) if hasattr(acting, "law") else None
-        if law is None:
-            return None
-        (about, arrays), head = _feedback(law), Head(made.task)
-    else:
+    data = policy.architecture.page_data(policy.arrays)
+    if data is None:
         return None
-    return about | {
-        "largest": head.largest,
-        "choices": head.choices,
+    return data.about | {
+        "largest": data.head.largest,
+        "choices": data.head.choices,
         # Sorted, because safetensors reads them in any order, and pages are named by their content.
-        "arrays": {name: _array(arrays[name]) for name in sorted(arrays)},
+        "arrays": {name: _array(data.arrays[name]) for name in sorted(data.arrays)},
     }
-
-
-def _learned(policy: SubmittedPolicy) -> dict[str, Any]:
-    """Return the page's data about a policy whose arrays it uses as they are."""
-    made: Any = policy.architecture
-    if isinstance(made, Linear):
-        return {"kind": "linear"}
-    if isinstance(made, GridArchitecture):
-        return {
-            "kind": f"{made.kind} table",
-            "sums": made.sums.tolist(),
-            "axes": made.axes,
-            "mirror": made.mirror,
-            "sign": made.sign,
-            "actions": made.actions,
-            "read": policy.agent().read.numbers(),
-            "interval": made.task.interval,
-        }
-    about = {
-        "layers": made.layers,
-        "activation": made.activation,
-        "bins": made.bins,
-        "controls": made.controls,
-        "squash": made.squash,
-        "mean_limit": made.mean_limit,
-        "normalise": made.normalise and made.normalise.model_dump(),
-    }
-    if isinstance(made, GRU):
-        return about | {"kind": "gru", "memory": made.memory}
-    return about | {"kind": "mlp", "frames": made.frames, "padding": made.padding}
-
-
-def _feedback(law: FeedbackLaw) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return the page's data about a controller that is pure feedback, and its arrays."""
-    if law.read is None:
-        return {"kind": "linear"}, {"gain": -law.gains[0].T, "offset": law.actions[0]}
-    arrays = {name: getattr(law, name) for name in ("states", "actions", "gains")}
-    return {"kind": "plan", "read": law.read.numbers()}, arrays
 
 
 def _array(array: Any) -> dict[str, Any]:
