@@ -393,53 +393,34 @@ def test_last_rewards(env_id, with_parameters):
 
 
 class Geared(own_tasks.Task):
-    """Limits of actions, and the largest action, that follow from parameters."""
+    """Limits of actions, and an attribute, that are computed from parameters."""
 
     scene = Pendulum
     start = {"theta": 0.2}
-    action = property(lambda self: {"torque": (-self.scene.mass, math.sqrt(8.0 * self.scene.gravity))})
+    action = property(lambda self: {"torque": math.sqrt(8.0 * self.scene.gravity)})
     largest_action = property(lambda self: 3.0 * self.scene.length)
+
+    def check(self):
+        self.weight = self.scene.mass**2
 
     def observe(self, after, target, xp):
         return {"theta": after.theta}
 
     def reward(self, before, after, control, target, dt, xp):
-        return -(after.theta**2) - 0.01 * control.torque**2
+        return -self.weight * after.theta**2 - 0.01 * control.torque**2
 
 
-class Kept(Geared):
-    """An attribute that follows from a parameter."""
-
-    def check(self):
-        self.weight = self.scene.mass**2
-
-    def reward(self, before, after, control, target, dt, xp):
-        return -self.weight * after.theta**2
-
-
-def test_limits_of_actions_that_follow_from_parameters():
-    """Within the limits, and clipped."""
-    given, task = (np.array([[0.1, -0.2], [0.3, 0.4]]), np.array([0.4, 5.0])), Geared()
-    names = ("mass", "gravity", "length", "damping")
-    found = Model(task).vjp(*given, by_states=1.0, by_rewards=2.0, parameters=names).parameters
-
-    def total(**changes):
-        ends, rewards, _ = Model(task.varied(**changes))(*given)
-        return ends.sum(axis=1) + 2.0 * rewards
-
-    for name, slope in zip(names, found.T, strict=True):
-        value = getattr(task.scene, name)
-        places = value + 1e-3 * (np.arange(5) - 2.0 * (value > 0.0))
-        weights = [1.0, -8.0, 0.0, 8.0, -1.0] if value else [-25.0, 48.0, -36.0, 16.0, -3.0]
-        slopes = [weight * total(**{name: place}) for weight, place in zip(weights, places, strict=True)]
-        np.testing.assert_allclose(slope, sum(slopes) / 12e-3, rtol=1e-8, atol=1e-9, err_msg=name)
-
-
-def test_numbers_kept_with_a_task_have_no_gradient():
-    given = [[0.1, -0.2]], [0.4]
-    assert Model(Kept()).vjp(*given, by_rewards=1.0, parameters=["gravity"]).parameters.shape == (1, 1)
-    with pytest.raises(ValueError, match=r"Kept uses self\.weight, which .* from self\.scene\.mass"):
-        Model(Kept()).vjp(*given, by_rewards=1.0, parameters=["mass"])
+def test_numbers_that_follow_from_a_parameter_outside_of_formulas():
+    """A gradient would lack what they contribute; other parameters have theirs."""
+    model, given = Model(Geared()), ([[0.1, -0.2]], [0.4])
+    found = model.vjp(*given, by_rewards=1.0, parameters=["damping"]).parameters
+    values = 1e-3 * np.arange(5)
+    rewards = [Model(Geared(damping=value))(*given)[1][0] for value in values]
+    np.testing.assert_allclose(found, np.dot([-25.0, 48.0, -36.0, 16.0, -3.0], rewards) / 12e-3, rtol=1e-8)
+    limits = "the limits of its actions"
+    for name, kept in {"mass": r"self\.weight", "gravity": limits, "length": limits}.items():
+        with pytest.raises(ValueError, match=rf"Geared computes {kept} from {name} .* or leave {name} out"):
+            model.vjp(*given, by_rewards=1.0, parameters=["damping", name])
 
 
 def test_what_is_clipped_has_no_gradient():

@@ -26,7 +26,7 @@ from lag_envs.stepping.compiling import split_lengths
 from lag_envs.stepping.normal_forms import lifted
 from lag_envs.stepping.tracing import Trace, clip
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.formulas import NUMBERS, TaskFormulas
+from lag_envs.tasks.formulas import NUMBERS
 
 Array = NDArray[np.float64]
 
@@ -62,11 +62,7 @@ class Reverse:
         # Formulas may use the normal form's constants (`Task.coefficients`), which depend on parameters too.
         rates = derivatives_of(task.scene, parameters).rates if parameters else {}
         self._moving = [name for name in rates if name in constants]
-        limits = _limit_rates(task, parameters)
-        self._limits = bool(limits)
-        if limits:
-            rates, constants = {**rates, **limits}, constants | _limits_of(formulas)
-            self._moving += limits
+        _check_parameters(task, parameters)
         constants |= {
             f"rate_{name}_{p}": x
             for name in self._moving
@@ -187,12 +183,6 @@ class Reverse:
         ]
 
     def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list:
-        if self._limits:
-            top = k.largest
-            shares = [0.5 + 0.5 * (clip(x, -top, top, xp) / top) for x in a]
-            ends = [(getattr(k, f"low{i}"), getattr(k, f"high{i}")) for i in range(len(a))]
-            asked = [low + (high - low) * share for (low, high), share in zip(ends, shares, strict=True)]
-            return self._formulas.guarded(xp, asked, lifted(self._form, y, xp), k)
         top = self._formulas.largest
         return self._formulas.control(
             xp, [clip(x, -top, top, xp) for x in a], lifted(self._form, y, xp), g, k
@@ -279,70 +269,39 @@ def kick_depends_on_state(task: Task) -> bool:
     return any(x.name in used for x in z)
 
 
-def _limits_of(formulas: TaskFormulas) -> dict[str, float]:
-    """Return the largest action and the limits of the controls, by name."""
-    ends = {f"{end}{i}": getattr(a, end) for i, a in enumerate(formulas.acting) for end in ("low", "high")}
-    return {"largest": formulas.largest} | ends
+def _check_parameters(task: Task, parameters: tuple[str, ...]) -> None:
+    """Raise a ValueError if the task computes a number from one of the parameters outside of its formulas.
 
-
-def _limit_rates(task: Task, parameters: tuple[str, ...]) -> dict[str, list[float]]:
-    """Return the derivatives of the limits of actions with respect to parameters; nothing if all are 0.
-
-    They are finite differences, since a task's ``action`` may be any function of the scene.
-
-    Raises
-    ------
-    ValueError
-        If a formula uses a number that follows from a parameter and is computed outside of the formulas.
+    Such a number is a constant in the formulas, so a gradient would lack what it contributes.
     """
-    found: dict[str, list[float]] = {}
-    for j, name in enumerate(parameters):
-        weights, near = _neighbours(task, name)
-        if not near:
+    for name in parameters:
+        near = _neighbours(task, name)
+        if len({each.formulas.recorded() for each in near}) < 2:
             continue
-        _check_held(task, name, near)
-        limits = [_limits_of(other.formulas) for other in near]
-        for of, first in limits[0].items():
-            values = [each[of] for each in limits]
-            if any(value != first for value in values):
-                found.setdefault(of, [0.0] * len(parameters))[j] = float(np.dot(weights, values))
-    return found
+        one, other = near
+        kept = [
+            f"self.{key}"
+            for key, value in vars(one).items()
+            if key not in NUMBERS and repr(value) != repr(vars(other).get(key))
+        ]
+        if one.formulas.acting != other.formulas.acting or one.formulas.largest != other.formulas.largest:
+            kept.append("the limits of its actions")
+        raise ValueError(
+            f"{type(task).__name__} computes {' and '.join(kept) or 'a number'} from {name} outside of its "
+            f"formulas, so a gradient by {name} would ignore it; compute it in a formula from "
+            f"self.scene.{name}, or leave {name} out"
+        )
 
 
-def _neighbours(task: Task, name: str) -> tuple[Array, list[Task]]:
-    """Return tasks with other values of a parameter, and the weights of a difference of fourth order.
-
-    No task is returned if the parameter cannot be set, or not changed.
-    """
+def _neighbours(task: Task, name: str) -> list[Task]:
+    """Return two tasks with other values of a parameter, not 0; nothing if it cannot be changed."""
     scene = task.scene
     value, held = getattr(scene, name), {n: getattr(scene, n) for n in parameter_names(scene)}
-    step = 1e-3 * (abs(value) or 1.0)
-    ahead = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
-    ways = [
-        (np.array([1.0, -8.0, 8.0, -1.0]) / 12.0, (-2, -1, 1, 2)),
-        (ahead, range(5)),
-        (-ahead, range(0, -5, -1)),
-    ]
-    for weights, places in ways[value == 0.0 :]:
-        # At 0 the motion may have another form.
+    for way in (1e-3, -1e-3):
+        step = way * (abs(value) or 1.0)
         with suppress(ValueError, TypeError, ArithmeticError):
-            return weights / step, [task.varied(**held | {name: value + step * i}) for i in places]
-    return ahead, []
-
-
-def _check_held(task: Task, name: str, near: list[Task]) -> None:
-    """Raise a ValueError if formulas of tasks that differ in a parameter use other numbers of their own."""
-    one, other = near[-2:]
-    if one.formulas.recorded_with(task.formulas) == other.formulas.recorded_with(task.formulas):
-        return
-    changed = [
-        key for key, x in vars(one).items() if key not in NUMBERS and repr(x) != repr(vars(other).get(key))
-    ]
-    of, kept = type(task).__name__, " and ".join(f"self.{key}" for key in changed) or "a number"
-    raise ValueError(
-        f"a formula of {of} uses {kept}, which follows from {name} and is computed outside of the formulas, "
-        f"so a gradient by {name} would ignore it; compute it in the formula, from self.scene.{name}"
-    )
+            return [task.varied(**held | {name: value + step * i}) for i in (1, 2)]
+    return []
 
 
 def _sums(*lists: list) -> list:

@@ -175,8 +175,8 @@ class TaskFormulas:
         known = _checked.setdefault(type(task), {})
         key = self.key
         if key not in known:
-            names, code = self._recorded()
-            if self._recorded() != (names, code):
+            names, code = self.recorded()
+            if self.recorded() != (names, code):
                 raise FormulaError(
                     f"{self._of}: a formula gives another result when it is run again; formulas may "
                     "depend on their arguments and on parameters only, not on time or chance"
@@ -225,7 +225,7 @@ class TaskFormulas:
             shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
             formulas: Any = (*(getattr(kind, name) for name in FORMULAS), *own, *shared)
         else:
-            formulas = self._recorded()
+            formulas = self.recorded()
         return self._task.scene.mechanics.key, self._task.variant, formulas, *plain
 
     def refusal(self, state: Any, control: Any, dt: float, where: str) -> StepRefused:
@@ -425,7 +425,7 @@ class TaskFormulas:
                 raise FormulaError(f"{self._of}.observe: names must be texts, got {name!r:.60}")
         return [_counted(value) for value in found.values()]
 
-    def _recorded(self) -> tuple[tuple[str, ...], str]:
+    def recorded(self) -> tuple[tuple[str, ...], str]:
         """Run all formulas, for their errors; return the observation's names and a digest of the code."""
         _check_arguments(self._task, self._base)
         trace = self.trace(numeric=True)
@@ -456,12 +456,6 @@ class TaskFormulas:
             self._check_numbers(name, dict(zip(entries, found[name], strict=True)), k, "numbers")
         code = trace.operations([ended, *itertools.chain(*found.values())])
         return names, hashlib.sha256(repr(code).encode()).hexdigest()
-
-    def recorded_with(self, other: TaskFormulas) -> tuple[tuple[str, ...], str]:
-        """Return what determines the formulas, with the limits of actions of another task of this class."""
-        formulas = copy.copy(self)
-        formulas.acting, formulas.largest = other.acting, other.largest
-        return formulas._recorded()
 
     def _check_numbers(self, name: str, found: Mapping[str, Any], k: Any, wanted: str) -> None:
         """Raise a FormulaError if a recorded formula returns anything but numbers; named ones are finite."""
