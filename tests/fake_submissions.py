@@ -57,7 +57,8 @@ def about(files):
 
 def load(folder):
     told = about(read_files(folder))
-    policies = tuple((seed, SimpleNamespace(architecture=None, arrays={})) for seed in told.seeds)
+    architecture = SimpleNamespace(page_data=lambda arrays: None)
+    policies = tuple((seed, SimpleNamespace(architecture=architecture, arrays={})) for seed in told.seeds)
     return Submission(**vars(told), policies=policies, folder=Path(folder))
 
 
