@@ -712,7 +712,7 @@ def test_making_again_derives_nothing(env_id, monkeypatch):
 
     monkeypatch.setattr("lag_envs.mechanics.motion.derive_motion", refuse)
     monkeypatch.setattr("lag_envs.mechanics.recording.record_scene", refuse)
-    monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._recorded", refuse)
+    monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas.recorded", refuse)
     make(env_id, **others)
 
 
