@@ -273,7 +273,7 @@ def test_in_a_browser(site, browser):
 
 @pytest.mark.slow
 def test_documentation_and_board_share_their_head(site, browser):
-    """Its parts have the same places, colours and letters, and the choice of light or dark is one."""
+    """Its parts have the same places, colours and fonts, and the choice of light or dark holds on both."""
     parts = [
         (".md-header .md-ellipsis", ".brand b"),
         (".md-header .md-logo img", ".brand img"),

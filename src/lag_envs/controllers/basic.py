@@ -35,14 +35,14 @@ class FeedbackLaw(NamedTuple):
 
 
 class Agent(ABC):
-    """What our agents have besides `predict`; of agents of other libraries, only `predict` is asked.
+    """Base of our agents. Agents of other libraries need only `predict`.
 
     Attributes
     ----------
     random : bool
         Whether it draws random numbers, for all episodes together.
     of_one_interval : bool
-        Whether its memory belongs to steps of one length.
+        Whether its memory is valid only for steps of one length.
     plans_at_start : bool
         Whether all planning is done at the start of an episode.
     """

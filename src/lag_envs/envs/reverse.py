@@ -288,8 +288,8 @@ def _check_parameters(task: Task, parameters: tuple[str, ...]) -> None:
             kept.append("the limits of its actions")
         raise ValueError(
             f"{type(task).__name__} computes {' and '.join(kept) or 'a number'} from {name} outside of its "
-            f"formulas, so a gradient by {name} would ignore it; compute it in a formula from "
-            f"self.scene.{name}, or leave {name} out"
+            f"formulas, so a gradient by {name} would lack that part; use self.scene.{name} in a formula "
+            f"instead, or leave {name} out"
         )
 
 

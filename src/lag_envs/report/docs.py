@@ -55,7 +55,7 @@ PARTS = (
         "Bar, incline and shell have dedicated steps. lag_envs is measured as shipped, at rounding error. "
         "A rival gets the scene's own equation, and is in its fastest form, with the setting that just "
         "reaches an error; *carried* means that it takes cosine and sine along as unknowns, which is faster "
-        "than to compute them at every stage. Only lag_envs has a bound before the step. The table names the "
+        "than computing them at every stage. Only lag_envs has a bound before the step. The table names the "
         "fastest rival for each error, with its time as a multiple of that of lag_envs: below 1 the rival is "
         "faster.",
         (),

@@ -18,7 +18,7 @@
     if (dataset.scheme !== scheme) dataset.scheme = scheme;
   }
 
-  /** Choose the other one, and store it as the theme does: the place of the button's choice, and what it means. */
+  /** Switch between light and dark, and store the choice as the theme does: its number, and its scheme. */
   function choose() {
     const dark = getComputedStyle(document.documentElement).colorScheme === "dark";
     const scheme = dark ? "default" : "slate";
