@@ -259,6 +259,7 @@ function open(root, board, code, tools) {
   let running = false;
   let tapped = null;
   let [before, left, shownAt] = [0, 0, 0];
+  let places = null;
   let [past, now] = [me.poses(), me.poses()];
   const [between, ghostly] = [roomOf(about), roomOf(about)];
   let picture = board.picture;
@@ -572,16 +573,25 @@ function open(root, board, code, tools) {
 
   /** Write the numbers. While they change they are painted, because laying out text takes a browser milliseconds. */
   function readOut(told) {
+    if (!running || readout.children.length !== told.length) {
+      writeList(readout, told);
+      places = null;
+    }
     const { pen, width } = cleared(values);
-    if (!running || readout.children.length !== told.length) writeList(readout, told);
+    if (running && width) {
+      places ??= placesOf(readout);
+      [pen.font, pen.fillStyle, pen.textBaseline] = [places.font, places.colour, "middle"];
+      told.forEach(([, value], i) => pen.fillText(value, ...places.at[i]));
+    }
     writeList(spoken, running ? told : []); // within the canvas, for those who do not see it
-    if (!running || !width) return;
-    const { fontSize, fontFamily, color } = getComputedStyle(readout.lastChild.lastChild);
-    [pen.font, pen.fillStyle, pen.textBaseline] = [`${fontSize} ${fontFamily}`, color, "middle"];
-    told.forEach(([, value], i) => {
-      const { offsetLeft, offsetTop, offsetHeight } = readout.children[i].lastChild;
-      pen.fillText(value, offsetLeft, offsetTop + offsetHeight / 2);
-    });
+  }
+
+  /** Where the numbers of a list stand and how they look: asked seldom, as the browser may have to lay out the page. */
+  function placesOf({ children }) {
+    const cells = [...children].map((row) => row.lastChild);
+    const { fontSize, fontFamily, color } = getComputedStyle(cells[0]);
+    const at = cells.map(({ offsetLeft, offsetTop, offsetHeight }) => [offsetLeft, offsetTop + offsetHeight / 2]);
+    return { font: `${fontSize} ${fontFamily}`, colour: color, at };
   }
 
   /** The names and values of the read-out. */
@@ -867,7 +877,11 @@ function open(root, board, code, tools) {
   const there = [...(navigator.getGamepads?.() ?? [])].find((pad) => pad?.connected);
   if (there) take(there);
   followHash();
-  return { show: () => show(1), get episode() { return me; } };
+  const redraw = () => {
+    places = null; // the page's size or colours have changed
+    show(1);
+  };
+  return { show: redraw, get episode() { return me; } };
 }
 
 window.lagEnvs.put({ Episode, agentOf, hexOf, lacking, open });
