@@ -284,6 +284,8 @@ def test_documentation_and_board_share_their_head(site, browser):
         const look = getComputedStyle(e);
         return [look.color, look.fontFamily, look.fontWeight];
     }).concat(getComputedStyle(document.body).backgroundColor)"""
+    scheme = """[getComputedStyle(document.documentElement).colorScheme,
+        getComputedStyle(document.body).backgroundColor]"""
     left = "(e) => e.getBoundingClientRect().left + parseFloat(getComputedStyle(e).paddingLeft)"
     page = browser.new_page()
     for width in (1280, 1920):
@@ -301,8 +303,8 @@ def test_documentation_and_board_share_their_head(site, browser):
         schemes = []
         for there in ("index", "board/index"):
             page.goto(f"{site.as_uri()}/{there}.html")
-            schemes.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
-        assert len(set(schemes)) == 1 and (schemes[0] != seen[0][-1]) == (name == "board/index")
+            schemes.append(page.evaluate(scheme))
+        assert schemes[0] == schemes[1] and (schemes[0][1] != seen[0][-1]) == (name == "board/index")
     page.close()
 
 

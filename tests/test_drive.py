@@ -495,9 +495,10 @@ def test_what_the_browser_lacks_is_told(browsing, bare):
     page.click(".begin")
     until(page, f"{status}.includes('from the end of 2020 on')")
     assert page.is_enabled(".begin") and page.evaluate("document.querySelector('.stage') === null")
+    assert not page.is_visible(".unable")
     page.add_init_script("delete Element.prototype.replaceChildren")
     page.reload()
-    until(page, f"{status}.includes('from the end of 2020 on')")
+    assert "from the end of 2020" in page.inner_text("#drive .unable") and not page.is_visible(".begin")
 
 
 def test_names_for_those_who_do_not_see(drive):

@@ -713,6 +713,7 @@ def test_without_script_the_tables_remain(open_page):
     page = open_page(java_script_enabled=False)
     assert page.evaluate("document.querySelector('.ranking').innerText").count("\n") > 20
     assert page.evaluate("getComputedStyle(document.querySelector('#watch')).display") == "none"
+    assert page.is_visible("#drive .unable"), "old browsers, which cannot read the script, are told too"
 
 
 def test_served(open_page, served):

@@ -1300,11 +1300,7 @@
   // --- start -----------------------------------------------------------------------------------------------
 
   // Old browsers show the page as it is without scripts.
-  if (!Element.prototype.replaceChildren) {
-    const said = find("#drive .status");
-    if (said) said.textContent = TOO_OLD;
-    return;
-  }
+  if (!Element.prototype.replaceChildren) return;
   window.lagEnvs = { put, load, placed, windowOf, apart };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
