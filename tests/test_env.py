@@ -776,6 +776,8 @@ def test_what_is_decided_when_an_environment_is_made_cannot_be_set(name):
         setattr(env, name, 1.5)
     env.note = "one's own"
     assert copy.deepcopy(env).note == "one's own"
+    with pytest.raises(AttributeError, match=r"^state cannot be assigned; call reset\(options=\{'state'"):
+        env.state = [0.0, 0.0]
 
 
 @pytest.mark.parametrize("name", ["gentle", "dt", "interval", "scene", "anything"])

@@ -48,7 +48,12 @@ class TaskEnv:
         self._spec = None if value is None else true_spec(value, self._limit)
 
     def check_settable(self, name: str) -> None:
-        """Raise an AttributeError for what is decided when the environment is made."""
+        """Raise an AttributeError for what is decided when the environment is made, and for its state."""
+        if name == "state":
+            raise AttributeError(
+                "state cannot be assigned; call reset(options={'state': ...}), or set_state with a snapshot "
+                "from get_state"
+            )
         parameters = (field.name for field in dataclasses.fields(self.task.scene))
         if name in ("task", "scene", "dt", "duration", *KEYWORDS, *parameters):
             raise AttributeError(

@@ -123,7 +123,7 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     _made = False
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name[:1] != "_" and self._made and not hasattr(type(self), name):
+        if name[:1] != "_" and self._made and (name == "state" or not hasattr(type(self), name)):
             self.check_settable(name)
         object.__setattr__(self, name, value)
 
