@@ -37,6 +37,13 @@ class TaskEnv:
     _limit: float
     _started: bool
     _spec: EnvSpec | None = None
+    #: Whether everything is decided. (Looking into `__dict__` for it would slow down every later step.)
+    _made = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name[:1] != "_" and self._made and (name == "state" or not hasattr(type(self), name)):
+            self.check_settable(name)
+        object.__setattr__(self, name, value)
 
     @property
     def spec(self) -> EnvSpec | None:
