@@ -175,6 +175,7 @@ def test_sums_with_cosines_stay_factors_apart():
         many = math.prod(function_of("sin", i * X) + function_of("cos", Y + i) + C for i in range(1, 9))
         assert len(many.terms) == 1
         wind = Expr.of(Atom("velocity", "a")) - Expr.of(Atom("control", "w"))
+        assert (wind * wind * wind).same(wind**3) and len((-wind * wind * wind).terms) == 1
         assert len((wind * wind).terms) == 1 and len(linear_opened(wind**2 * K).terms) == 3
         assert len(linear_opened(wind**2 * function_of("sqrt", 1 + wind**2)).terms) == 1
     assert len((w * w).terms) == 3 and len((wind * wind).terms) == 3

@@ -234,8 +234,11 @@ class Expr:
 
     def __mul__(self, other: Any) -> Expr:
         second = Expr.of(other)
-        kept = self._kept(2) if self.same(second) else _kept_product(self, second)
-        return _expanded(self, second) if kept is None else kept
+        ratio = second._ratio(self)
+        kept = _kept_product(self, second) if ratio is None else self._kept(2)
+        if kept is None:
+            return _expanded(self, second)
+        return kept if ratio is None else kept * ratio
 
     __rmul__ = __mul__
 
