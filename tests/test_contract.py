@@ -319,6 +319,41 @@ def test_wells_about_a_far_place_take_few_substeps(where, products):
         assert scene.step_bound(state, control, 0.02).substeps <= 3
 
 
+class Balloon(Scene):
+    """A balloon in a wind; its drag grows with the square of its speed relative to the air."""
+
+    calm: float = parameter(1e-4, "m²/s²", least=0.0)
+    leak: float = parameter(0.1, "N s/m", least=0.0)
+    coordinates = {"x": "m", "y": "m"}
+    controls = {"wind": "m/s"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.x**2 + v.y**2)
+
+    def potential(self, q, xp):
+        return 0.1 * q.y
+
+    def dissipation(self, q, v, u, xp):
+        squared = (v.x - u.wind) ** 2 + v.y**2
+        return squared * xp.sqrt(squared + self.calm) / 3 + self.leak * (v.x - v.y) ** 2
+
+
+@pytest.mark.parametrize("calm", [1e-4, 0.0])
+@pytest.mark.parametrize("wind", [10.0, -1000.0])
+def test_drag_in_a_wind_takes_few_substeps(wind, calm):
+    """Multiplied out, the relative speed lost its digits: a step took 9,583 attempts in a wind of 10 m/s."""
+    scene, state = Balloon(calm=calm, leak=0.0), np.array([0.5, wind + 0.1, 0.2, 0.1])
+    exact = np.array([float(x) for x in agreed_end(oracle_of(scene), state, [wind], 0.02)])
+    error = np.abs(scene.simulate(state, [wind], 0.02)[-1] - exact)
+    assert (error <= 1e-15 * np.maximum(1.0, np.abs(exact))).all()
+    assert scene.step_bound(state, wind, 0.02).substeps <= 3
+
+
+def test_terms_of_linear_drag_combine():
+    text = Balloon().mechanics.force[0].text
+    assert "leak*velocity x" in text and "leak*velocity y" in text
+
+
 def test_product_of_a_sum_has_the_record_of_its_power():
     class Spring(Wells):
         def potential(self, q, xp):

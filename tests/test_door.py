@@ -246,6 +246,17 @@ def assignment_to_a_coordinate():
     return changed(potential=formula)
 
 
+@mistake("potential", "another result on plain numbers", "numbers kept from an earlier run")
+def number_kept_from_an_earlier_run():
+    kept = []
+
+    def formula(self, q, xp):
+        kept.append(q.x)
+        return kept[0] ** 2
+
+    return changed(potential=formula)
+
+
 # --- invalid energies --------------------------------------------------------------------------------------
 
 INVALID = {

@@ -771,11 +771,15 @@ def test_attributes_set_by_hand_are_not_taken_from_elsewhere(monkeypatch):
 
 @pytest.mark.parametrize("name", ["damping", "dt", "scene", "task", "action_noise"])
 def test_what_is_decided_when_an_environment_is_made_cannot_be_set(name):
-    env = make(incline.Brake.id)
-    with pytest.raises(AttributeError, match=rf"^{name} cannot be set .* make another one with other keyw"):
-        setattr(env, name, 1.5)
-    env.note = "one's own"
-    assert copy.deepcopy(env).note == "one's own"
+    for env in (make(incline.Brake.id), gym.make_vec(incline.Brake.id, num_envs=2)):
+        with pytest.raises(
+            AttributeError, match=rf"^{name} cannot be set .* make another one with other keyw"
+        ):
+            setattr(env, name, 1.5)
+        env.note = "one's own"
+        assert copy.deepcopy(env).note == "one's own"
+        with pytest.raises(AttributeError, match=r"^state cannot be assigned; call reset\(options=\{'state'"):
+            env.state = [0.0, 0.0]
 
 
 @pytest.mark.parametrize("name", ["gentle", "dt", "interval", "scene", "anything"])

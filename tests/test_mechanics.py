@@ -18,6 +18,7 @@ from lag_envs.mechanics.algebra import (
     derivative,
     evaluate,
     function_of,
+    linear_opened,
     opened,
     substitute,
 )
@@ -173,7 +174,11 @@ def test_sums_with_cosines_stay_factors_apart():
         assert len(square.terms) == 1 and len((square + w**2).terms) == 2
         many = math.prod(function_of("sin", i * X) + function_of("cos", Y + i) + C for i in range(1, 9))
         assert len(many.terms) == 1
-    assert len((w * w).terms) == 3
+        wind = Expr.of(Atom("velocity", "a")) - Expr.of(Atom("control", "w"))
+        assert (wind * wind * wind).same(wind**3) and len((-wind * wind * wind).terms) == 1
+        assert len((wind * wind).terms) == 1 and len(linear_opened(wind**2 * K).terms) == 3
+        assert len(linear_opened(wind**2 * function_of("sqrt", 1 + wind**2)).terms) == 1
+    assert len((w * w).terms) == 3 and len((wind * wind).terms) == 3
     shift = {PLACES[0]: X + 1}  # puts in a place, and takes nothing apart
     assert len(substitute(square, shift).terms) == 1
     assert len(substitute(square, {place: Expr.of(1) for place in PLACES}).terms) == 0

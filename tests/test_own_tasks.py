@@ -6,6 +6,7 @@ import inspect
 import math
 import pickle
 import warnings
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -774,6 +775,19 @@ def test_a_task_is_no_dataclass():
     decorated = dataclasses.dataclass(type("Decorated", (own_tasks.Deliver,), {}))
     with pytest.raises(FormulaError, match="Decorated must not be a dataclass: tasks are written without"):
         decorated()
+
+
+def test_an_own_init_that_does_not_call_that_of_tasks():
+    class Bare(own_tasks.Deliver):
+        id = ""
+
+        def __init__(self, bonus=1.0):
+            self.bonus = bonus
+
+    for made in (Bare, partial(LagrangianEnv, Bare)):
+        with pytest.raises(FormulaError, match=r"Bare.__init__ must call super\(\).__init__\(\*\*keywords\)"):
+            made(bonus=2.0)
+    assert list(inspect.signature(Bare).parameters) == ["bonus"]
 
 
 def test_a_keyword_of_ones_own_stays_where_parameters_are_drawn():

@@ -37,6 +37,13 @@ class TaskEnv:
     _limit: float
     _started: bool
     _spec: EnvSpec | None = None
+    #: Whether everything is decided. (Looking into `__dict__` for it would slow down every later step.)
+    _made = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name[:1] != "_" and self._made and (name == "state" or not hasattr(type(self), name)):
+            self.check_settable(name)
+        object.__setattr__(self, name, value)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -48,7 +55,12 @@ class TaskEnv:
         self._spec = None if value is None else true_spec(value, self._limit)
 
     def check_settable(self, name: str) -> None:
-        """Raise an AttributeError for what is decided when the environment is made."""
+        """Raise an AttributeError for what is decided when the environment is made, and for its state."""
+        if name == "state":
+            raise AttributeError(
+                "state cannot be assigned; call reset(options={'state': ...}), or set_state with a snapshot "
+                "from get_state"
+            )
         parameters = (field.name for field in dataclasses.fields(self.task.scene))
         if name in ("task", "scene", "dt", "duration", *KEYWORDS, *parameters):
             raise AttributeError(

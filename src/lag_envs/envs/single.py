@@ -119,14 +119,6 @@ class LagrangianEnv(TaskEnv, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._bind()
         self._made = True
 
-    #: Whether everything is decided. (Looking into `__dict__` for it would slow down every later step.)
-    _made = False
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name[:1] != "_" and self._made and not hasattr(type(self), name):
-            self.check_settable(name)
-        object.__setattr__(self, name, value)
-
     def _bind(self) -> None:
         self._step = self._program.step_one
         self._viewer: Any = None

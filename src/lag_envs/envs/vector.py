@@ -180,6 +180,7 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         self._loop = 0
         #: Arguments of the calls that helpers are offered, by their number and the type of actions.
         self._calls: dict[tuple[int, np.dtype], list[tuple]] = {}
+        self._made = True
 
     # --- Gymnasium's interface -----------------------------------------------------------------------------
 

@@ -53,10 +53,11 @@ _apart: ContextVar[bool] = ContextVar("apart", default=False)
 
 @contextmanager
 def apart(wanted: bool = True) -> Iterator[None]:
-    """Keep squares and products of sums with sines and cosines as they are, within this context.
+    """Keep squares and products of sums with sines and cosines, and squares with velocities, as they are.
 
     A kinetic energy is expanded, since cos² + sin² = 1 shortens it. In other formulas, expansion would turn a
-    quantity that depends on the distance of two nearby points into a small difference of large numbers.
+    quantity that depends on the distance of two nearby points, or on the speed relative to a wind, into a
+    small difference of large numbers.
     """
     token = _apart.set(wanted)
     try:
@@ -233,8 +234,11 @@ class Expr:
 
     def __mul__(self, other: Any) -> Expr:
         second = Expr.of(other)
-        kept = self._kept(2) if self.same(second) else _kept_product(self, second)
-        return _expanded(self, second) if kept is None else kept
+        ratio = second._ratio(self)
+        kept = _kept_product(self, second) if ratio is None else self._kept(2)
+        if kept is None:
+            return _expanded(self, second)
+        return kept if ratio is None else kept * ratio
 
     __rmul__ = __mul__
 
@@ -298,17 +302,21 @@ class Expr:
     def _stays(self, exponent: int) -> bool:
         """Return whether this power of the sum is not expanded.
 
-        A square is expanded if its terms may combine with others: those with velocities, and, except within
-        `apart`, sines and cosines by cos² + sin² = 1.
+        Except within `apart`, a square is expanded if its terms may combine with others: those with
+        velocities, and sines and cosines by cos² + sin² = 1.
         """
         if len(self.terms) < 2:
             return False
         moving = [a for a in self.atoms() if any(s.kind != "parameter" for s in Expr.of(a).symbols())]
         if exponent > 2:
             return bool(moving)
-        meets = () if _apart.get() else ("sin", "cos")
-        return bool(moving) and not any(
-            a.function in meets or s.kind == "velocity" for a in moving for s in Expr.of(a).symbols()
+        return bool(moving) and (
+            _apart.get()
+            or not any(
+                a.function in ("sin", "cos") or s.kind == "velocity"
+                for a in moving
+                for s in Expr.of(a).symbols()
+            )
         )
 
     def _has_velocity(self) -> bool:
@@ -679,8 +687,24 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
                     factor = function_of(atom.function, inner)
                 else:
                     factor = _whole(inner) if with_velocity or inner._is_apart() else inner
-            product = product * factor**n
+            with apart(atom.function == "sum" or _apart.get()):  # what was kept, is kept again
+                power = factor**n
+            product = product * power
         total = total + product
+    return total
+
+
+def linear_opened(loss: Expr) -> Expr:
+    """Return a dissipation with the squares multiplied out whose drag is linear: its terms can combine."""
+    total = Expr({})
+    for monomial, c in loss.terms.items():
+        moving = [f for f in monomial if any(s.kind != "parameter" for s in Expr.of(f[0]).symbols())]
+        term = Expr({monomial: c})
+        if len(moving) == 1 and moving[0][0].function == "sum" and moving[0][1] == 2:
+            inner: Any = moving[0][0].argument
+            rest = Expr({tuple(f for f in monomial if f not in moving): c})
+            term = _expanded(_expanded(inner, inner), rest)
+        total = total + term
     return total
 
 

@@ -15,7 +15,16 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from lag_envs.errors import hint
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, RecordedFunctions, apart, raised, substitute
+from lag_envs.mechanics.algebra import (
+    Atom,
+    Expr,
+    FormulaError,
+    RecordedFunctions,
+    apart,
+    linear_opened,
+    raised,
+    substitute,
+)
 from lag_envs.mechanics.equations import Energies, place, velocity
 from lag_envs.mechanics.identities import shorter
 from lag_envs.mechanics.layout import SceneLayout
@@ -305,6 +314,7 @@ def record_scene(scene: Any, layout: SceneLayout) -> SceneRecord:
             parts[name] = single_expression(run(name))
     for name in ("kinetic", "potential"):
         parts[name] = shorter(parts[name])
+    parts["dissipation"] = linear_opened(parts["dissipation"])
     with formula(scene, "applied"), apart():
         applied = _by_name(run("applied"), names, "coordinate")
     with formula(scene, "rests"):

@@ -271,7 +271,7 @@ class Scene(metaclass=SceneType):
 
     @_QUIET
     def acceleration(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
-        """Return the accelerations of the free coordinates, by name.
+        """Return the accelerations of the free coordinates, by name; not finite where the motion is singular.
 
         Parameters
         ----------
@@ -372,7 +372,7 @@ class Scene(metaclass=SceneType):
         Returns
         -------
         A : ndarray, shape (..., n_state, n_state)
-            ∂(d state/dt)/∂state, exact.
+            ∂(d state/dt)/∂state, exact; not finite, without an error, where the motion is singular.
         B : ndarray, shape (..., n_state, n_controls)
             ∂(d state/dt)/∂control.
         """

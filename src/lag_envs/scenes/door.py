@@ -162,9 +162,9 @@ def _check_bodies(scene: Any) -> None:
 def _check_on_numbers(scene: Any, found: Mechanics) -> None:
     """Raise a FormulaError if a formula gives something else on plain numbers than what was recorded.
 
-    This happens if a formula asks for a parameter's type or text. Each formula is tried at two points. An
-    allowance is made for rounding: where terms cancel in the record, plain numbers may leave a little of the
-    squares of a formula's parameters, or of a parameter that drops out.
+    This happens if a formula asks for a parameter's type or text, or keeps a number. Each formula is tried at
+    two points. An allowance is made for rounding: where terms cancel in the record, plain numbers may leave a
+    little of the squares of a formula's parameters, or of a parameter that drops out.
     """
     layout, parameters = found.layout, recording.parameter_values(scene)
     largest = max(map(abs, parameters.values()), default=0.0)
@@ -192,13 +192,16 @@ def _check_on_numbers(scene: Any, found: Mechanics) -> None:
             continue
         for outcomes, parts, x, rounding in zip(alike, terms, plain, allowed, strict=True):
             total, size = sum(parts), sum(map(abs, parts))
-            if not isinstance(x, complex) and math.isfinite(size) and math.isfinite(x):
+            if isinstance(x, Expr):  # kept from an earlier run
+                outcomes.add(False)
+            elif not isinstance(x, complex) and math.isfinite(size) and math.isfinite(x):
                 outcomes.add(bool(abs(x - total) <= 1e-6 * size + rounding))
     for (name, _), outcomes in zip(names, alike, strict=True):
         if outcomes == {False}:
             raise FormulaError(
                 f"{type(scene).__name__}.{name} gives another result on plain numbers than on recorded ones; "
-                "it must not depend on the type or the text of a number, nor on what is set in __post_init__"
+                "it must not depend on the type or the text of a number, on numbers kept from an earlier "
+                "run, nor on what is set in __post_init__"
             )
 
 

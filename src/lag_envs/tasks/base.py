@@ -7,10 +7,11 @@ import dataclasses
 import inspect
 import math
 import numbers
+from abc import ABCMeta
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from types import MappingProxyType, SimpleNamespace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -43,22 +44,30 @@ OF_ENVIRONMENTS = ("render_mode", "diagnostics", "show_arrows", "show_trail", "s
 OF_BATCHES = ("num_envs", "max_episode_steps", "autoreset_mode", "num_threads", "show_tiles")
 
 
-class _Made:
-    """Remembers the arguments of a task, among which may be those of a subclass.
+class TaskType(ABCMeta):
+    """The type of tasks; a task remembers its arguments, among which may be those of a subclass."""
 
-    It is a class of its own so that the signature of `Task` is that of its ``__init__``.
-    """
-
-    _made_with: tuple[tuple, dict[str, Any]]
-
-    def __new__(cls, *given: Any, **keywords: Any) -> Self:
+    def __call__(cls, *given: Any, **keywords: Any) -> Any:
+        """Return a task with checked formulas."""
         check_definition(cls, Task)
-        task = super().__new__(cls)
+        kind: Any = cls
+        task = kind.__new__(kind)
         vars(task)["_made_with"] = given, keywords
+        task.__init__(*given, **keywords)
+        if "imperfections" not in vars(task):
+            raise FormulaError(
+                f"{cls.__name__}.__init__ must call super().__init__(**keywords), which makes the task"
+            )
         return task
 
+    @property
+    def __signature__(cls) -> inspect.Signature:
+        """The signature of a call, for help."""
+        signature = inspect.signature(cls.__init__)  # type: ignore[misc]
+        return signature.replace(parameters=list(signature.parameters.values())[1:])
 
-class Task(_Made):
+
+class Task(metaclass=TaskType):
     """A task on a scene.
 
     A subclass defines some of the attributes and methods below, at least `scene`, `action`, `observe` and
@@ -381,6 +390,8 @@ class Task(_Made):
         k = SimpleNamespace(**motion_constants_of(self.scene)) if recorded is None else recorded.k
         return form.coefficients_at(list(state), list(control), k, xp)
 
+    #: Arguments that the task was made with.
+    _made_with: tuple[tuple, dict[str, Any]]
     #: The recorded constants, while formulas are recorded.
     _recording: Any = None
 
