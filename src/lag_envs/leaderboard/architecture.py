@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Agent
+from lag_envs.controllers.basic import Agent, Stateless
 from lag_envs.leaderboard.fields import Strict
 from lag_envs.tasks.base import Task
 
@@ -124,7 +124,7 @@ def feedback_data(agent: Agent, task: Task) -> PageData | None:
     return PageData({"kind": "plan", "read": law.read.numbers()}, arrays, Head(task))
 
 
-class Memoryless(Agent):
+class Memoryless(Stateless):
     """Base of the agents without memory; a subclass defines `act`.
 
     Parameters
@@ -140,15 +140,13 @@ class Memoryless(Agent):
     def act(self, observations: Array) -> Array:
         """Return numbers (n, size) for the head, for observations (n, n_observation)."""
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray, Any]:
+    def answer(self, observation: NDArray) -> NDArray:
         """Return the action for each observation."""
         values = np.asarray(observation, np.float64)
         # An overflow ends as a non-finite action, which verification refuses.
         with np.errstate(all="ignore"):
             actions = self.head(self.act(np.atleast_2d(values)))
-        return actions.reshape((*values.shape[:-1], *actions.shape[1:])), state
+        return actions.reshape((*values.shape[:-1], *actions.shape[1:]))
 
 
 class Remembering(Agent):
