@@ -24,7 +24,7 @@ from lag_envs.leaderboard.log import (
     parse,
     read_log,
 )
-from lag_envs.leaderboard.pending import PendingCheck, finish
+from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.standings import board_data, page_data
 from lag_envs.options import count
 from lag_envs.tables import aligned
@@ -253,7 +253,7 @@ def _finish(board: Board, args: argparse.Namespace) -> int:
     def tell(entry: BoardEntry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
 
-    def parallel_map(check: PendingCheck, folders: Sequence[Path]) -> Iterable[tuple[Path, Any]]:
+    def parallel_map(check: Callable[[Path], Any], folders: Sequence[Path]) -> Iterable[tuple[Path, Any]]:
         from tqdm import tqdm
 
         from lag_envs.leaderboard.parallel import map_submissions, with_bar

@@ -274,7 +274,7 @@ class _Layers:
 
         x = features
         for k, (weight, bias) in enumerate(self.weights):
-            x = affine(np.ascontiguousarray(x), weight, bias)
+            x = affine(x, weight, bias)
             if k + 1 < len(self.weights):
                 x = self.f(x)
         return x
@@ -335,8 +335,8 @@ class _Recurrent(Remembering):
     def act(self, observations: Array, memories: Array) -> tuple[Array, Array]:
         from lag_envs.leaderboard.kernels import affine
 
-        seen = affine(np.ascontiguousarray(self.layers.normalised(observations)), *self.seen)
-        kept = affine(np.ascontiguousarray(memories), *self.kept)
+        seen = affine(self.layers.normalised(observations), *self.seen)
+        kept = affine(memories, *self.kept)
         (r_o, z_o, n_o), (r_h, z_h, n_h) = (np.split(part, 3, axis=1) for part in (seen, kept))
         z = _sigmoid(z_o + z_h)
         memories = (1.0 - z) * np.tanh(n_o + _sigmoid(r_o + r_h) * n_h) + z * memories
@@ -377,4 +377,4 @@ class _LinearFeedback(Memoryless):
     def act(self, observations: Array) -> Array:
         from lag_envs.leaderboard.kernels import affine
 
-        return affine(np.ascontiguousarray(observations), self.gain, self.offset)
+        return affine(observations, self.gain, self.offset)
