@@ -7,6 +7,18 @@ import numpy as np
 from lag_envs.scenes.base import Scene, parameter
 
 
+class Bead(Scene):
+    """A bead of 1 kg on a rail, the base of scenes with a potential or a force of their own."""
+
+    coordinates = {"x": "m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2
+
+    def potential(self, q, xp):
+        return 0.0
+
+
 class ChargedParticle(Scene):
     """A charge in a plane, in a magnetic field that grows with x: T has a linear part."""
 

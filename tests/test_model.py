@@ -7,12 +7,13 @@ from typing import ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract_scenes import Bead
 from covering import PERFECT, covering, engine, slow
 from rollouts import actions, make
 
 from lag_envs.controllers.mpc import MPC
 from lag_envs.envs.model import Model
-from lag_envs.scenes import Scene, StepRefused
+from lag_envs.scenes import StepRefused
 from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
 
 
@@ -51,12 +52,8 @@ def test_far_from_ordinary_steps_are_taken_too():
 def test_a_refusal_names_the_applied_control():
     """Not the action, which is clipped, scaled and guarded."""
 
-    class Uphill(Scene):
-        coordinates = {"x": "m"}
+    class Uphill(Bead):
         controls = {"f": "N"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
 
         def potential(self, q, xp):
             return xp.sqrt(q.x)

@@ -15,6 +15,7 @@ import numpy as np
 import own_tasks
 import pytest
 from batches import assert_alike, assert_same, pair
+from contract_scenes import Bead
 from covering import slow
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
@@ -225,12 +226,7 @@ def test_refused_step_keeps_the_state(wild, why):
 
 @pytest.mark.parametrize("place", [0.0, -1.0])
 def test_refusal_where_a_formula_has_no_value(place):
-    class Uphill(Scene):
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
-
+    class Uphill(Bead):
         def potential(self, q, xp):
             return xp.sqrt(q.x)
 
@@ -243,12 +239,7 @@ def test_refusal_where_a_formula_has_no_value(place):
 def test_the_motion_of_a_logarithm_is_that_of_the_size():
     """As docs/tutorial.md says: the equation of motion has its derivative only."""
 
-    class Charge(Scene):
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
-
+    class Charge(Bead):
         def potential(self, q, xp):
             return -xp.log(q.x)
 
