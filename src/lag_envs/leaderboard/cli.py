@@ -9,6 +9,7 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -221,10 +222,8 @@ def _publish(board: Board, value: str | None, source: str) -> None:
     if value is None:
         value, source = head_of(board), COMMIT
     elif not source and len(value) in (40, 64):
-        try:
+        with suppress(BoardError):
             source = COMMIT if head_of(board) == value else ""
-        except BoardError:
-            pass
     board.publish(value, source)
     print(f"nonce: {value}")
     if not source:
