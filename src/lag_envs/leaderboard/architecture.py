@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,27 +125,25 @@ def feedback_data(agent: Agent, task: Task) -> PageData | None:
 
 
 class Memoryless(Stateless):
-    """Base of the agents without memory; a subclass defines `act`.
+    """An agent without memory.
 
     Parameters
     ----------
     head : Head
         Turns numbers into actions.
+    numbers : callable
+        Returns numbers (n, size) for the head, for observations (n, n_observation).
     """
 
-    def __init__(self, head: Head) -> None:
-        self.head = head
-
-    @abstractmethod
-    def act(self, observations: Array) -> Array:
-        """Return numbers (n, size) for the head, for observations (n, n_observation)."""
+    def __init__(self, head: Head, numbers: Callable[[Array], Array]) -> None:
+        self.head, self.numbers = head, numbers
 
     def answer(self, observation: NDArray) -> NDArray:
         """Return the action for each observation."""
         values = np.asarray(observation, np.float64)
         # An overflow ends as a non-finite action, which verification refuses.
         with np.errstate(all="ignore"):
-            actions = self.head(self.act(np.atleast_2d(values)))
+            actions = self.head(self.numbers(np.atleast_2d(values)))
         return actions.reshape((*values.shape[:-1], *actions.shape[1:]))
 
 
