@@ -1,10 +1,11 @@
-"""Scenes for tests, each with a feature that the package's own scenes lack."""
+"""Scenes for tests, each with a feature that the package's own scenes lack, and a base of their tasks."""
 
 import dataclasses
 
 import numpy as np
 
 from lag_envs.scenes.base import Scene, parameter
+from lag_envs.tasks import Task
 
 
 class Bead(Scene):
@@ -17,6 +18,16 @@ class Bead(Scene):
 
     def potential(self, q, xp):
         return 0.0
+
+
+class Along(Task):
+    """The base of tasks with a coordinate x, which is all that is observed, and the reward."""
+
+    def observe(self, after, target, xp):
+        return {"x": after.x}
+
+    def reward(self, before, after, control, target, dt, xp):
+        return after.x
 
 
 class ChargedParticle(Scene):
