@@ -8,15 +8,11 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from agents.learners import LEARNERS, check_trainable, learner_label, load_policy, zoo_hyperparameters
@@ -39,6 +35,7 @@ from lag_envs.scores import known_returns, score
 from lag_envs.store import write_file
 from lag_envs.tables import aligned
 from lag_envs.tasks.registration import make_task
+from lag_envs.watch import watch
 
 EPISODES = 20
 EPILOG = """files in the output folder:
@@ -163,7 +160,7 @@ def report(run: Run, video: bool) -> None:
     )
     draw_curve(run, learner, result, returns)
     if video:
-        record_video(policy, run, seeds[0])
+        watch(run.env, policy, seed=seeds[0], video=run.path("episode.mp4"))
     print(f"In {run.folder}: " + ", ".join(sorted(p.name for p in run.folder.iterdir())))
 
 
@@ -193,25 +190,6 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=120)
     write_file(run.path("learning_curve.png"), drawn.getvalue())
-
-
-def record_video(policy: Any, run: Run, seed: int) -> None:
-    """Record one episode as a video."""
-    from gymnasium.wrappers import RecordVideo
-
-    with tempfile.TemporaryDirectory() as folder:
-        env = gym.make(run.env, render_mode="rgb_array")
-        with RecordVideo(
-            env, f"{folder}/video", episode_trigger=lambda n: n == 0, disable_logger=True
-        ) as env:
-            observation, _ = env.reset(seed=seed)
-            memory, over = None, False
-            while not over:
-                action, memory = policy.predict(observation, memory, deterministic=True)
-                observation, _, terminated, truncated, _ = env.step(action)
-                over = terminated or truncated
-        (video,) = Path(folder, "video").glob("*.mp4")
-        shutil.move(video, run.folder / "episode.mp4")
 
 
 if __name__ == "__main__":

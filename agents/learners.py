@@ -17,7 +17,7 @@ from copy import deepcopy
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ from lag_envs import __version__
 from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
 from lag_envs.host import machine
-from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
+from lag_envs.hyperparams import DISCRETISE
 from lag_envs.leaderboard import export, protocol
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.leaderboard.sb3_models import ModelPolicy
@@ -50,17 +50,42 @@ from lag_envs.store import write_file
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.registration import make_task
 
-#: Where each learner's class is found.
-ALGORITHMS = {name: place[:2] for name, place in export.ALGORITHMS.items() if name != "a2c"}
-#: Learners of our own: the module that trains each, and its name in tables.
-OWN = {
-    "fast_ppo": ("agents.ppo", "fast PPO"),
-    "shac": ("agents.shac", "SHAC"),
-    "cloning": ("agents.cloning", "cloning"),
+
+class Entry(NamedTuple):
+    """A learner.
+
+    Attributes
+    ----------
+    module, label : str
+        Where it is found, and its name in tables; for a learner of Stable-Baselines3, that of its class.
+    needs : str
+        The kind of actions that it needs; any kind if empty.
+    keeps_best : bool
+        Whether its policies get better and worse: the one that did best in a test is kept, not the last one.
+    """
+
+    module: str
+    label: str
+    needs: str = ""
+    keeps_best: bool = False
+
+
+CONTINUOUS, DISCRETE = "continuous actions", "one discrete action"
+#: Learners of Stable-Baselines3. DQN splits a continuous control into bins, see `make_envs`.
+ALGORITHMS = {
+    "ppo": Entry("stable_baselines3", "PPO"),
+    "sac": Entry("stable_baselines3", "SAC", CONTINUOUS, keeps_best=True),
+    "td3": Entry("stable_baselines3", "TD3", CONTINUOUS, keeps_best=True),
+    "dqn": Entry("stable_baselines3", "DQN", DISCRETE, keeps_best=True),
+    "tqc": Entry("sb3_contrib", "TQC", CONTINUOUS, keeps_best=True),
 }
-LEARNERS = (*ALGORITHMS, *OWN)
-#: Learners whose policies get better and worse: the policy that did best in a test is kept, not the last one.
-KEEP_BEST = (*OFF_POLICY, "dqn")
+#: Learners of our own, in the modules that train them.
+OWN = {
+    "fast_ppo": Entry("agents.ppo", "fast PPO"),
+    "shac": Entry("agents.shac", "SHAC", CONTINUOUS),
+    "cloning": Entry("agents.cloning", "cloning", CONTINUOUS),
+}
+LEARNERS = ALGORITHMS | OWN
 #: Episodes of each test during training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100
 #: Tests of one run; each gives a point of the learning curve and a checkpoint.
@@ -96,13 +121,13 @@ PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-co
 
 def learner_label(algo: str) -> str:
     """Return a learner's name in tables; any other agent has its own name."""
-    return {**ALGORITHMS, **OWN}.get(algo, ("", algo))[1]
+    return LEARNERS[algo].label if algo in LEARNERS else algo
 
 
 def learner(algo: str) -> type:
     """Return a learner's class."""
-    module, name = ALGORITHMS[known_name("algorithm", algo, ALGORITHMS)]
-    return getattr(import_module(module), name)
+    entry = ALGORITHMS[known_name("algorithm", algo, ALGORITHMS)]
+    return getattr(import_module(entry.module), entry.label)
 
 
 def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[str, Any]:
@@ -147,7 +172,7 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
 def check_hyperparameters(algo: str, hyperparameters: Mapping[str, Any]) -> None:
     """Raise a UserError for a missing or unknown hyperparameter, or one of the wrong type."""
     if algo in OWN:
-        import_module(OWN[algo][0]).Settings.of(hyperparameters)
+        import_module(OWN[algo].module).Settings.of(hyperparameters)
         return
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -211,24 +236,23 @@ def asked_wrappers(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 def suits(algo: str, task: Task) -> bool:
     """Return whether a learner supports a task's kind of actions: discrete or continuous."""
     choices = task.formulas.choices
-    return len(choices) == 1 if algo == "dqn" else not (choices and algo in (*OFF_POLICY, "shac", "cloning"))
+    return {CONTINUOUS: not choices, DISCRETE: len(choices) == 1}.get(LEARNERS[algo].needs, True)
 
 
 def check_suits(algo: str, env_id: str) -> None:
     """Raise a UserError for a learner that does not support an environment's kind of actions."""
     task = make_task(env_id)
     if not suits(algo, task):
-        fit = ", ".join(name for name in LEARNERS if suits(name, task))
-        needs, has = "continuous actions", "discrete ones"
-        if algo == "dqn":
-            needs, has = "one discrete action", "several" if task.formulas.actions > 1 else "a continuous one"
+        fit, needs = ", ".join(name for name in LEARNERS if suits(name, task)), LEARNERS[algo].needs
+        several = "several" if task.formulas.actions > 1 else "a continuous one"
+        has = "discrete ones" if needs == CONTINUOUS else several
         raise UserError(f"{algo} needs {needs}; {env_id} has {has}; available: {fit}")
 
 
 def check_trainable(algo: str, env_id: str) -> None:
     """Raise a UserError for a learner that cannot be used with an environment."""
     single = trainable(env_id).formulas.actions == 1
-    if not (algo == "dqn" and single):  # DQN splits a continuous control into bins
+    if not (LEARNERS[algo].needs == DISCRETE and single):  # a continuous control is split into bins
         check_suits(algo, env_id)
 
 
@@ -442,7 +466,11 @@ def train_rest(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run],
             mean = tested_return(run.env, policy_of(run.settings, self.model, normalise))
             run.trained = self.last = self.num_timesteps
             run.curve.append((run.trained, round(run.seconds, 3), mean))
-            if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
+            if (
+                best is None
+                or not ALGORITHMS[run.algo].keeps_best
+                or mean >= max(test[2] for test in run.curve)
+            ):
                 best = {**content, "buffer": None, "trained": run.trained}
             run.save_checkpoint({**content, "best": best})
             self.logger.record("test/mean_return", mean)
@@ -492,7 +520,7 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
     Tests during the training show its progress. They neither stop it nor select the policy that is kept.
     """
     content = run.load_checkpoint()
-    module = import_module(OWN[run.algo][0])
+    module = import_module(OWN[run.algo].module)
     learner = module.Learner(run.env, module.Settings.of(run.hyperparameters), run.seed, run.steps)
     if content is not None:
         try:
@@ -594,7 +622,7 @@ def load_policy(folder: str | Path) -> Any:
     result = read_result(folder / RESULT)
     try:
         if result["algo"] in OWN:
-            return import_module(OWN[result["algo"]][0]).Policy.load(folder / MODEL)
+            return import_module(OWN[result["algo"]].module).Policy.load(folder / MODEL)
         model = learner(result["algo"]).load(folder / MODEL, device="cpu", **export.LOADING)
         file = folder / NORMALISATION
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None

@@ -30,6 +30,7 @@ from agents.run import (
 )
 from agents.solution import RESULTS, GreedyPolicy, played
 from lag_envs import TASKS, __version__, controllers, store
+from lag_envs.controllers.basic import trait
 from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
 from lag_envs.evaluation.rollout import Meter, Rollout, RolloutStep, observation_std
 from lag_envs.evaluation.statistics import rounded_data
@@ -314,7 +315,7 @@ def measure_policies(todo: Sequence[tuple[Evaluation, MeasurementJob]]) -> None:
             for evaluation, job in group:
                 try:
                     # Random numbers start over, so that the order of measurements does not matter.
-                    if agent is None or hasattr(agent, "rng"):
+                    if agent is None or trait(agent, "random"):
                         agent = entrant.make()
                     if not job.condition.suits(agent, entrant.plans):
                         continue

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from agents import learners
+from agents import learners, train
 from agents.analysis import LEVELS, first_reached
 from agents.learners import LEARNERS, check_suits, learner_label, zoo_hyperparameters
 from agents.run import (
@@ -175,13 +175,6 @@ def earlier_rows(file: Path) -> list[dict[str, Any]]:
 
 # --- one training -------------------------------------------------------------------------------------------
 
-_events: Any = None
-
-
-def _begin(events: Any) -> None:
-    global _events
-    _events = events
-
 
 def raced(settings: dict[str, Any], show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """Train in a new process, and show its progress; return the curve and both clocks, or why it failed."""
@@ -190,7 +183,7 @@ def raced(settings: dict[str, Any], show: Callable[[dict[str, Any]], None]) -> d
     show(now)
     events = multiprocessing.get_context("spawn").Queue()
     # The folder belongs to this process, so it is removed even if the other process is killed.
-    with tempfile.TemporaryDirectory() as folder, workers.processes(1, _begin, events) as submit:
+    with tempfile.TemporaryDirectory() as folder, workers.processes(1, train.begin, events) as submit:
         future = submit(train_seed, settings, Path(folder))
         while not future.done():
             with suppress(queue.Empty):
@@ -214,7 +207,7 @@ def train_seed(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         nonlocal last
         if time.monotonic() - last > 0.2:
             last = time.monotonic()
-            _events.put({"trained": run.trained, "seconds": run.seconds, "curve": list(curve)})
+            train.tell({"trained": run.trained, "seconds": run.seconds, "curve": list(curve)})
 
     def tested(run: Run) -> None:
         nonlocal trained

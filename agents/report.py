@@ -30,17 +30,8 @@ plus_minus = partial(mean_with_error, most=4, exact=2)
 # --- the page -----------------------------------------------------------------------------------------------
 
 
-def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
-    """Return docs/agents.md.
-
-    Parameters
-    ----------
-    data : dict
-        What ``agents/results/summary.json`` holds.
-    notes : mapping of str to str, optional
-        A text for each environment; by default the `note` of its task.
-    """
-    notes = {id: task.note for id, task in TASKS.items()} if notes is None else notes
+def agents_page(data: Data) -> str:
+    """Return docs/agents.md, from what ``agents/results/summary.json`` holds."""
     envs = data["envs"]
     parts = [
         "# Agents: what they reach",
@@ -52,7 +43,8 @@ def agents_page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         _reading(),
     ]
     for env_id, env in envs.items():
-        parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else [])]
+        note = TASKS[env_id].note.strip() if env_id in TASKS else ""
+        parts += [f"## {env_id}", *([note] if note else [])]
         parts += [_range(env_id, env), *_optimum(env_id)]
         parts += [_env_table(env, data["episodes"]), *_times(env), *_behaviour(env_id)]
         parts += _real_time(env_id)

@@ -118,8 +118,8 @@ def submit_learned(env_id: str, runs: Path, folder: Path) -> Submission:
     """Write the finished runs of a learner as a submission, with a folder for each seed."""
     algo = runs.name
     name = learner_label(algo)
-    origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
-    module = OWN[algo][0].removeprefix("agents.") if algo in OWN else "learners"
+    origin = OWN[algo].module if algo in OWN else "Stable-Baselines3"
+    module = OWN[algo].module.removeprefix("agents.") if algo in OWN else "learners"
     made, off, count = export(
         find([runs]), folder, env=env_id, name=name, authors=OURS, license=LICENSE,
         description=f"{origin}, with the hyperparameters that `lag-envs hyperparams` prints",

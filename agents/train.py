@@ -245,17 +245,24 @@ def train_run(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> Fa
     return None
 
 
+#: The queue to the process that started this one.
 _events: Any = None
 
 
-def _begin(events: Any) -> None:
+def begin(events: Any) -> None:
+    """Take the queue for `tell`; for the start of a process."""
     global _events
     _events = events
 
 
+def tell(event: Any) -> None:
+    """Send an event to the process that started this one."""
+    _events.put(event)
+
+
 def _here(run: Run) -> Failure | None:
     """Train the run that this process was started for."""
-    return train_run(run, _events.put)
+    return train_run(run, tell)
 
 
 def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> Failure | None:
@@ -271,7 +278,7 @@ def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> F
 def train_in_processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[Callable]:
     """Train runs in processes; give a function that returns the next event, or None."""
     events = multiprocessing.get_context("spawn").Queue()
-    with workers.processes(jobs or os.cpu_count() or 1, _begin, events) as submit:
+    with workers.processes(jobs or os.cpu_count() or 1, begin, events) as submit:
         yield partial(poll, events, {submit(_here, run): run for run in runs})
 
 

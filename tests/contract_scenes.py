@@ -1,10 +1,33 @@
-"""Scenes for tests, each with a feature that the package's own scenes lack."""
+"""Scenes for tests, each with a feature that the package's own scenes lack, and a base of their tasks."""
 
 import dataclasses
 
 import numpy as np
 
 from lag_envs.scenes.base import Scene, parameter
+from lag_envs.tasks import Task
+
+
+class Bead(Scene):
+    """A bead of 1 kg on a rail, the base of scenes with a potential or a force of their own."""
+
+    coordinates = {"x": "m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2
+
+    def potential(self, q, xp):
+        return 0.0
+
+
+class Along(Task):
+    """The base of tasks with a coordinate x, which is all that is observed, and the reward."""
+
+    def observe(self, after, target, xp):
+        return {"x": after.x}
+
+    def reward(self, before, after, control, target, dt, xp):
+        return after.x
 
 
 class ChargedParticle(Scene):

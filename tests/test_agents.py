@@ -244,10 +244,10 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path, monkeypatch):
     # A video that fails costs no more than itself.
     (folder / "comparison.json").unlink()
 
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device", "episode.mp4")
+    def full(*_, **options):
+        raise OSError(errno.ENOSPC, "No space left on device", options["video"])
 
-    monkeypatch.setattr(demo, "record_video", full)
+    monkeypatch.setattr(demo, "watch", full)
     status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
     assert status == 1 and "agents.demo: error: " in output and "episode.mp4" in output
     assert "switching line" in output and (folder / "comparison.json").exists()

@@ -33,22 +33,16 @@ each_perfect = pytest.mark.parametrize("env_id", covering(PERFECT))
 each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
 each_perfect_single = pytest.mark.parametrize("env_id", covering(i for i in SINGLE if i in PERFECT))
 
-#: Parameters that a scene, or a task, must refuse.
+#: Parameters that a scene, or a task, must refuse. For what is no number, see test_hostile.
 IMPOSSIBLE = {
     PivotedBar: [
         {"mass": 0.0},
-        {"mass": -1.0},
-        {"com_distance": math.nan},
         {"inertia": -1e-9},
-        {"damping": -0.1},
         {"gravity": math.inf},
         {"track": 0.0},
-        {"track": "long"},
-        {"mass": True},
-        {"mass": "0.2"},
     ],
     pivoted_bar.Balance: [{"track": None}, {"track": math.inf}],
-    Incline: [{"radius": 0.0}, {"mass": math.nan}, {"gravity": -1.0}, {"damping": math.inf}],
+    Incline: [{"radius": 0.0}, {"gravity": -1.0}, {"damping": math.inf}],
     incline.Tilt: [
         {"control": "damping"},
         {"control": "magic"},
@@ -606,16 +600,13 @@ def test_targets(env_id):
 # --- time ---
 
 
-def steps_until_truncated(env, action=0.0):
+def steps_until_truncated(env):
     env.reset(seed=1)
     for n in range(1, 100_000):
-        *_, terminated, truncated, _ = env.step(
-            np.full(env.action_space.shape, action, env.action_space.dtype)
-        )
+        *_, terminated, truncated, _ = env.step(nothing(env))
         if truncated:
             return n
         if terminated:
-            env.reset(seed=1)
             return None
     return None
 

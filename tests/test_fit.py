@@ -75,9 +75,9 @@ def swings(steps=100):
 
 
 @cache
-def ride(steps=120):
+def ride():
     """Return the cart-pole's states under random forces, and the forces."""
-    forces = np.repeat(np.random.default_rng(2).uniform(-4.0, 4.0, -(-steps // 5)), 5)[:steps]
+    forces = np.repeat(np.random.default_rng(2).uniform(-4.0, 4.0, 24), 5)
     return motion(cart, CART, [0.0, 0.0, 2.5, 0.0], forces, 0.02), forces
 
 
@@ -85,10 +85,10 @@ def noisy(states, sizes, seed):
     return states + np.random.default_rng(seed).standard_normal(states.shape) * sizes
 
 
-def agrees(found, truth, times=4.0):
-    """Return whether estimates are within this many standard errors of the truth."""
+def agrees(found, truth):
+    """Return whether estimates are within four standard errors of the truth."""
     errors = [abs(found.estimates[n] - truth[n]) / found.errors[n] for n in found.estimates]
-    assert max(errors) < times, errors
+    assert max(errors) < 4.0, errors
     return True
 
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import struct
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -553,10 +554,8 @@ def test_every_single_bit_flip_is_refused_or_harmless(folder):
             changed = bytearray(content)
             changed[i] ^= bit
             file.write_bytes(changed)
-            try:
+            with suppress(Refused):
                 assert load(folder).digest != first
-            except Refused:
-                pass
 
 
 # --- what costs time ---

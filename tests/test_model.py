@@ -7,13 +7,14 @@ from typing import ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract_scenes import Along, Bead
 from covering import PERFECT, covering, engine, slow
 from rollouts import actions, make
 
 from lag_envs.controllers.mpc import MPC
 from lag_envs.envs.model import Model
-from lag_envs.scenes import Scene, StepRefused
-from lag_envs.tasks import TASKS, Task, incline, pivoted_bar
+from lag_envs.scenes import StepRefused
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 
 @pytest.mark.parametrize("env_id", covering(PERFECT, engine))
@@ -51,12 +52,8 @@ def test_far_from_ordinary_steps_are_taken_too():
 def test_a_refusal_names_the_applied_control():
     """Not the action, which is clipped, scaled and guarded."""
 
-    class Uphill(Scene):
-        coordinates = {"x": "m"}
+    class Uphill(Bead):
         controls = {"f": "N"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
 
         def potential(self, q, xp):
             return xp.sqrt(q.x)
@@ -64,18 +61,12 @@ def test_a_refusal_names_the_applied_control():
         def applied(self, q, v, u, xp):
             return {"x": u.f}
 
-    class Climb(Task):
+    class Climb(Along):
         scene = Uphill
         action = {"f": (0.0, 50.0)}
 
         def guard(self, wanted, before, dt, xp):
             return {"f": wanted.f - xp.sqrt(3.0 - before.x)}
-
-        def observe(self, after, target, xp):
-            return {"x": after.x}
-
-        def reward(self, before, after, control, target, dt, xp):
-            return after.x
 
     model = Model(Climb())
     for action, control in ((0.5, 35.5), (7.0, 48.0)):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import sympy
+from contract_scenes import Bead
 from covering import every, slow
 from mpmath import mp, mpf
 from plain_target import FLOATS
@@ -319,12 +320,8 @@ def test_sympy_gives_the_equations_that_were_typed_in(system):
 def test_floats_are_taken_as_they_are():
     """0.1 is not a tenth: neither as a parameter nor in a formula."""
 
-    class Slide(Scene):
+    class Slide(Bead):
         push: float = parameter(0.1, "N")
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
 
         def potential(self, q, xp):
             return -(self.push + 0.1) * q.x
@@ -336,12 +333,8 @@ def test_floats_are_taken_as_they_are():
 def test_functions_of_a_formula():
     """Each of them, by energy: the place determines how much of the initial speed is left."""
 
-    class Hill(Scene):
+    class Hill(Bead):
         kind: str = "tan"
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
 
         def potential(self, q, xp):
             return getattr(xp, self.kind)(0.5 + q.x**2)
@@ -354,14 +347,10 @@ def test_functions_of_a_formula():
         assert abs(v - mpf(0.2)) > 1e-3
 
 
-class Wall(Scene):
+class Wall(Bead):
     """A singular potential at 0, which attracts or repels."""
 
     sign: float = parameter(1.0, "J")
-    coordinates = {"x": "m"}
-
-    def kinetic(self, q, v, xp):
-        return 0.5 * v.x**2
 
     def potential(self, q, xp):
         return self.sign * xp.log(q.x)

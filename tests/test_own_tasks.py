@@ -16,6 +16,7 @@ import numpy as np
 import own_tasks
 import pytest
 from batches import assert_alike, assert_same, pair
+from contract_scenes import Along, Bead
 from covering import slow
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
@@ -226,12 +227,7 @@ def test_refused_step_keeps_the_state(wild, why):
 
 @pytest.mark.parametrize("place", [0.0, -1.0])
 def test_refusal_where_a_formula_has_no_value(place):
-    class Uphill(Scene):
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
-
+    class Uphill(Bead):
         def potential(self, q, xp):
             return xp.sqrt(q.x)
 
@@ -244,12 +240,7 @@ def test_refusal_where_a_formula_has_no_value(place):
 def test_the_motion_of_a_logarithm_is_that_of_the_size():
     """As docs/tutorial.md says: the equation of motion has its derivative only."""
 
-    class Charge(Scene):
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
-
+    class Charge(Bead):
         def potential(self, q, xp):
             return -xp.log(q.x)
 
@@ -554,18 +545,14 @@ def test_mistakes_in_a_task(changes, message):
         _mistaken(**changes)().formulas.box()
 
 
-class Pushed(Scene):
+class Pushed(Bead):
     """A bead on a rail that is pushed at a given rate: its state holds w."""
 
-    coordinates = {"x": "m"}
     prescribed = {"s": "m"}
     controls = {"s_dot": "m/s"}
 
     def kinetic(self, q, v, xp):
         return 0.5 * (v.x + v.s) ** 2
-
-    def potential(self, q, xp):
-        return 0.0
 
 
 class Hidden(Scene):
@@ -838,17 +825,11 @@ def test_a_length_that_is_zero_in_part_of_a_batch(potential):
 
     Beads.potential = potential
 
-    class Shift(Task):
+    class Shift(Along):
         id = "OwnShift-v0"
         scene = Beads
         action = {"force": 1.0}
         start = {"x": 0.3, "y": 0.2}
-
-        def observe(self, after, target, xp):
-            return {"x": after.x}
-
-        def reward(self, before, after, control, target, dt, xp):
-            return after.x
 
     envs = LagrangianVectorEnv(Shift, 2, length=np.array([0.0, 0.1]))
     singles = [LagrangianEnv(Shift, length=length) for length in (0.0, 0.1)]
@@ -982,18 +963,12 @@ def test_a_friction_that_is_zero_in_part_of_a_batch():
         def applied(self, q, v, u, xp):
             return {"x": u.force - self.friction * xp.tanh(v.x / 0.02)}
 
-    class Slide(Task):
+    class Slide(Along):
         id = "OwnSlide-v0"
         scene = Sled
         interval, steps = 0.05, 100
         action = {"force": 8.0}
         start = {"a": 1.0, "x_dot": 0.5}
-
-        def observe(self, after, target, xp):
-            return {"x": after.x}
-
-        def reward(self, before, after, control, target, dt, xp):
-            return after.x
 
     envs = LagrangianVectorEnv(Slide, 2, friction=np.array([0.0, 1.0]))
     ones = [LagrangianEnv(Slide, friction=friction) for friction in (0.0, 1.0)]

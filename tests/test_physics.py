@@ -122,13 +122,10 @@ def test_forces_are_newton(scene):
         state = rng.uniform(-2.0, 2.0, len(scene.state_names))
         point = body._point(state, u)[0]
         q, v = coordinates(scene)
-        values = []
-        for c in moving(scene):
-            values.append((getattr(q, c).diff(t, 2), float(point.acceleration[c])))
-        for c in moving(scene):
-            values.append((getattr(v, c), float(point.values[velocity(c)])))
-        for c in moving(scene):
-            values.append((getattr(q, c), float(point.values[place(c)])))
+        # Derivatives first: a place that is replaced by a number has none.
+        values = [(getattr(q, c).diff(t, 2), float(point.acceleration[c])) for c in moving(scene)]
+        values += [(getattr(v, c), float(point.values[velocity(c)])) for c in moving(scene)]
+        values += [(getattr(q, c), float(point.values[place(c)])) for c in moving(scene)]
         twin = symbolic(scene)
         values += [(getattr(twin, name), number) for name, number in numbers.items()] + [(U, u)]
 

@@ -168,13 +168,15 @@ def test_columns_of_a_row():
     assert row["often"] == pytest.approx(iqm(0.5 + moved))
     assert len(row["profile"]) == len(THRESHOLDS)
     # Unmeasured columns are None, as for an agent that cannot act more often.
-    bare = {"policies": [{"returns": returns(row)} for row in scores], "often": [None] * 5}
-    row = columns(ENV, bare, 10, KNOWN, table(scores))
-    assert [row[key] for key in ("success", "settle", "effort", "often")] == [None] * 4
+    never = [policy | {"settle": [None] * 40} for policy in results]
+    row = columns(ENV, result | {"policies": never, "often": [None] * 5}, 10, KNOWN, table(scores))
+    assert row["settle"] is row["often"] is None
 
 
 def test_success_is_left_out_where_the_protocol_cannot_count_it():
-    result = {"policies": [{"returns": returns([1.0] * 40), "success": [False] * 40}]}
+    policy = {"returns": returns([1.0] * 40), "success": [False] * 40}
+    policy |= {"settle": [None] * 40, "effort": [0.0] * 40}
+    result = {"policies": [policy], "robustness": {}, "often": [None]}
     for env_id, task in TASKS.items():
         if task.goal:
             row = columns(env_id, result, 10, KNOWN, table([1.0] * 40))

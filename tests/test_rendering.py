@@ -6,6 +6,7 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract_scenes import Along
 from covering import covering, slow
 from own_tasks import Crane, Deliver
 from pictures import IDS, TASKS, length, moment, picture, shown
@@ -330,7 +331,6 @@ def test_forces_are_to_scale_and_point_where_they_push():
 def test_controls_without_an_arrow_of_their_own_get_one():
     from lag_envs.envs.forces import Forces
     from lag_envs.scenes import Scene
-    from lag_envs.tasks import Task
 
     class Cart(Scene):
         coordinates = {"x": "m", "angle": "rad"}
@@ -354,15 +354,9 @@ def test_controls_without_an_arrow_of_their_own_get_one():
         def bodies(self):
             return {"cart": [Circle((0.0, 0.0), 0.1)], "wheel": [Circle((0.0, 0.0), 0.1)]}
 
-    class Drive(Task):
+    class Drive(Along):
         scene = Cart
         action = {"push": 2.0, "twist": 1.0, "brake": (0.0, 4.0)}
-
-        def observe(self, after, target, xp):
-            return {"x": after.x}
-
-        def reward(self, before, after, control, target, dt, xp):
-            return 0.0
 
     task = Drive()
     picture = Picture(task)

@@ -416,12 +416,13 @@ def test_arrival_by_hand():
     }
 
 
-def test_notes_are_about_environments_that_exist_and_hold_no_numbers():
+def test_notes_hold_no_numbers_and_are_shown(monkeypatch):
     """A number needs a command that measures it, and those stand in tables."""
     for task in TASKS.values():
         text = task.note
         assert text and not re.search(r"\d", text.replace("TD3", "")), text
-    assert "It is best." in report.agents_page(invented(), {"PivotedBar-v0": "It is best."})
+    monkeypatch.setattr(TASKS["PivotedBar-v0"], "note", "It is best.")
+    assert "It is best." in report.agents_page(invented())
 
 
 def test_committed_page_is_made_from_the_committed_results():

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import flint
 import numpy as np
 import pytest
-from contract_scenes import ElasticPendulum, Trolley
+from contract_scenes import Bead, ElasticPendulum, Trolley
 from covering import every, slow
 from llvmlite import binding, ir
 from mpmath import mp, mpf
@@ -447,17 +447,10 @@ class Polar(Scene):
         return 2.0 * q.r**2
 
 
-class Sled(Scene):
+class Sled(Bead):
     """Sliding with a drag that is far too heavy for a series."""
 
     drag: float = parameter(1e9, "N s/m", least=0.0)
-    coordinates = {"x": "m"}
-
-    def kinetic(self, q, v, xp):
-        return 0.5 * v.x**2
-
-    def potential(self, q, xp):
-        return 0.0
 
     def dissipation(self, q, v, u, xp):
         return 0.5 * self.drag * v.x**2
@@ -577,14 +570,10 @@ def test_tanh_that_rounds_to_one_keeps_its_digits(x):
     assert scene.jacobian([x, rate, 0.0, 0.0], [], dt)[0][3, 0] == pytest.approx(wanted, rel=1e-12)
 
 
-class Ledge(Scene):
+class Ledge(Bead):
     """A ledge, steep at 0 and nearly level elsewhere."""
 
     height: float = parameter(1000.0, "J")
-    coordinates = {"x": "m"}
-
-    def kinetic(self, q, v, xp):
-        return v.x**2 / 2
 
     def potential(self, q, xp):
         return self.height * xp.tanh(q.x)

@@ -25,9 +25,9 @@ CASES = [
 ]
 
 
-def go_on(env: gym.Env, steps: int, seed: int = 0) -> list:
+def go_on(env: gym.Env, steps: int) -> list:
     """Return everything observable in this many steps, resets included."""
-    rng, seen = np.random.default_rng(seed), []
+    rng, seen = np.random.default_rng(0), []
     for _ in range(steps):
         action = (
             rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)

@@ -26,7 +26,6 @@ from agents.run import Run, UserError
 from lag_envs import cli, own_files, sb3
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import OFF_POLICY, as_yaml
-from lag_envs.leaderboard.networks import bin_centres
 from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS, incline
 from lag_envs.tasks.arm import Reach
@@ -179,12 +178,6 @@ def test_a_task_changes_parts_of_the_policys_settings(monkeypatch):
     usual = zoo_hyperparameters("td3", ENV)["policy_kwargs"]
     monkeypatch.setattr(task, "hyperparameters", own)
     assert zoo_hyperparameters("td3", ENV)["policy_kwargs"] == usual | {"noise_steps": 4, "noise": 0.1}
-
-
-def test_bins_are_gymnasiums():
-    with gym.make(ENV) as env:
-        wrapped = gym.wrappers.DiscretizeAction(env, 9)
-        np.testing.assert_allclose(bin_centres(9)[:, None], [wrapped.action(i) for i in range(9)], atol=1e-7)
 
 
 def test_learners_refuse_what_they_do_not_know(tmp_path):

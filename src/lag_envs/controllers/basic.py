@@ -35,7 +35,7 @@ class FeedbackLaw(NamedTuple):
 
 
 class Agent(ABC):
-    """Base of our agents. Agents of other libraries need only `predict`.
+    """Base of our agents. Agents of other libraries need only `predict`, see `trait`.
 
     Attributes
     ----------
@@ -45,11 +45,14 @@ class Agent(ABC):
         Whether its memory is valid only for steps of one length.
     plans_at_start : bool
         Whether all planning is done at the start of an episode.
+    pace : float or None
+        By how much each call advances its clock, which an evaluation sets; None if it counts no steps.
     """
 
     random = False
     of_one_interval = False
     plans_at_start = False
+    pace: float | None = None
 
     @abstractmethod
     def predict(
@@ -62,7 +65,26 @@ class Agent(ABC):
         return None
 
 
-class Constant(Agent):
+def trait(agent: Any, name: str) -> Any:
+    """Return an attribute of `Agent`; an agent of another library that lacks it has the default."""
+    return getattr(agent, name, getattr(Agent, name))
+
+
+class Stateless(Agent):
+    """Base of the agents without memory; a subclass defines `answer`."""
+
+    @abstractmethod
+    def answer(self, observation: NDArray) -> NDArray:
+        """Return the action for each observation."""
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the action for each observation; the state is passed on."""
+        return self.answer(observation), state
+
+
+class Constant(Stateless):
     """Always the same action.
 
     Parameters
@@ -74,12 +96,10 @@ class Constant(Agent):
     def __init__(self, action: Any) -> None:
         self.action = action
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray, Any]:
+    def answer(self, observation: NDArray) -> NDArray:
         """Return the action, for each observation."""
         own: NDArray = np.atleast_1d(np.asarray(self.action, np.float32))
-        return np.tile(own, (*np.shape(observation)[:-1], 1)), state
+        return np.tile(own, (*np.shape(observation)[:-1], 1))
 
     def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback."""
@@ -95,7 +115,7 @@ def constant(task: Task, *, action: Any) -> Constant | Choice:
     return Choice(task, choice=action)
 
 
-class Feedback(Agent):
+class Feedback(Stateless):
     """Actions that are linear in the observation, clipped.
 
     Parameters
@@ -112,12 +132,10 @@ class Feedback(Agent):
         if self.gain.shape != (wanted := (task.formulas.actions, len(task.observation))):
             raise ValueError(f"gain must have shape {wanted}, got {self.gain.shape}")
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray[np.float32], Any]:
+    def answer(self, observation: NDArray) -> NDArray[np.float32]:
         """Return the action, for each observation."""
         values = check_observation(self.task, observation)
-        return np.clip(values @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
+        return np.clip(values @ self.gain.T, -self.largest, self.largest).astype(np.float32)
 
     def law(self, task: Task) -> FeedbackLaw:
         """Return the controller as feedback."""
@@ -134,7 +152,7 @@ def feedback(task: Task, **gains: float) -> Feedback:
     return Feedback(task, gain=[[gains.get(name, 0.0) for name in task.observation]])
 
 
-class Switch(Agent):
+class Switch(Stateless):
     """The largest control, in the direction given by the sign of a weighted sum of observations.
 
     Parameters
@@ -153,12 +171,10 @@ class Switch(Agent):
         self.task = task
         self.weights = np.array([weights.get(name, 0.0) for name in task.observation])
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray, Any]:
+    def answer(self, observation: NDArray) -> NDArray:
         """Return the action for each observation."""
         side = np.where(check_observation(self.task, observation) @ self.weights < 0.0, -1.0, 1.0)
-        return actions_for(self.task, side * self.task.limit_control), state
+        return actions_for(self.task, side * self.task.limit_control)
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
@@ -167,7 +183,7 @@ def do_nothing(of: gym.Env | Task) -> Constant | Choice:
     return Choice(task) if task.formulas.choices else Constant(task.rest_action)
 
 
-class Choice(Agent):
+class Choice(Stateless):
     """In tasks whose actions are choices, always the same choice, or a random one.
 
     Parameters
@@ -187,18 +203,16 @@ class Choice(Agent):
         self.choice = np.asarray(task.rest_action if choice is None else choice, np.int64)
         self.shape = Actions(task.formulas).shape
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray, Any]:
+    def answer(self, observation: NDArray) -> NDArray:
         """Return the choice, for each observation."""
         shape = (*np.shape(observation)[:-1], *self.shape)
         if self.rng is None:
-            return np.broadcast_to(self.choice, shape).copy(), state
+            return np.broadcast_to(self.choice, shape).copy()
         choices = self.task.formulas.choices
-        return self.rng.integers(choices if self.shape else choices[0], size=shape), state
+        return self.rng.integers(choices if self.shape else choices[0], size=shape)
 
 
-class Random(Agent):
+class Random(Stateless):
     """Uniformly random actions.
 
     Parameters
@@ -216,12 +230,10 @@ class Random(Agent):
     def __init__(self, seed: int, count: int = 1, largest: float = 1.0) -> None:
         self.rng, self.count, self.largest = np.random.default_rng(seed), count, largest
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray[np.float32], Any]:
+    def answer(self, observation: NDArray) -> NDArray[np.float32]:
         """Return an action for each observation."""
         shape = (*np.shape(observation)[:-1], self.count)
-        return self.rng.uniform(-self.largest, self.largest, shape).astype(np.float32), state
+        return self.rng.uniform(-self.largest, self.largest, shape).astype(np.float32)
 
 
 def at_random(task: Task, seed: int = 0) -> Random | Choice:
@@ -231,7 +243,7 @@ def at_random(task: Task, seed: int = 0) -> Random | Choice:
     return Random(seed, task.formulas.actions, task.formulas.largest)
 
 
-class FeedbackController(Agent):
+class FeedbackController(Stateless):
     """Base of the controllers without memory, whose control depends on the state alone.
 
     A subclass defines `control`. Controls beyond the task's limit are clipped.
@@ -252,11 +264,9 @@ class FeedbackController(Agent):
     def control(self, state: Array, target: Array) -> Array:
         """Return controls [SI units] for states (..., n_state) and targets (...): see `actions_for`."""
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray, Any]:
+    def answer(self, observation: NDArray) -> NDArray:
         """Return the action for each observation."""
-        return actions_for(self.task, self.control(*self.read(observation))), state
+        return actions_for(self.task, self.control(*self.read(observation)))
 
 
 def actions_for(task: Task, controls: Array) -> NDArray:

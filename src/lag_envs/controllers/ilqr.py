@@ -35,6 +35,12 @@ class Plan(NamedTuple):
     memory: Any  # of the controller that continues after the plan
 
 
+def put(plans: Any, rows: NDArray, others: Any, those: Any = slice(None)) -> None:
+    """Replace states, actions and gains of some plans by those of others."""
+    for name in ("states", "actions", "gains"):
+        getattr(plans, name)[rows] = getattr(others, name)[those]
+
+
 class ILQR(Agent):
     """Plan each episode at its start with the exact model, and follow the plan by time-varying feedback.
 
@@ -114,8 +120,7 @@ class ILQR(Agent):
         if fresh.any():
             new, _ = self.plan(x[fresh], target[fresh])
             plan = plan._replace(**{name: getattr(plan, name).copy() for name in plan._fields[:4]})
-            for name in ("states", "actions", "gains"):
-                getattr(plan, name)[fresh] = getattr(new, name)
+            put(plan, fresh, new)
             plan.step[fresh] = 0
         rows, now = np.arange(n), np.minimum(plan.step, self.steps - 1)
         off = self.read.difference(x, plan.states[rows, now])  # a plan's angles may exceed ±π
@@ -148,8 +153,7 @@ class ILQR(Agent):
                 best, most = plan, returns
                 continue
             better = returns > most
-            for name in ("states", "actions", "gains"):
-                getattr(best, name)[better] = getattr(plan, name)[better]
+            put(best, better, plan, better)
             most = np.maximum(most, returns)
         assert best is not None
         return best, most

@@ -33,8 +33,7 @@ class Clocked(Agent):
         self.read = ObservationDecoder(task, complete=complete)
         self._chooses = bool(task.formulas.choices)
         self.largest = task.formulas.largest
-        #: By how much each `predict` advances the clock; less than 1 if the agent acts more often.
-        self.pace = 1.0
+        self.pace: float = 1.0  # less if the agent acts more often
 
     @abstractmethod
     def act(self, states: Array, targets: Array, taken: Array) -> Array:

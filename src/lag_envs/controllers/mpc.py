@@ -18,7 +18,7 @@ from lag_envs.controllers.basic import (
     check_continuous,
     check_counts,
 )
-from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan
+from lag_envs.controllers.ilqr import ILQR, SHARES, Feedback, Plan, put
 from lag_envs.controllers.linear import regulator, time_varying
 from lag_envs.controllers.swing_up import away
 from lag_envs.controllers.tracking import Tracking, hold, plans_of, recorded, smoothed, waves
@@ -239,8 +239,7 @@ class MPC(Agent):
     @staticmethod
     def _keep(plan: Ahead, rows: NDArray[np.intp], found: Ahead) -> None:
         """Store new plans."""
-        for name in ("states", "actions", "gains"):
-            getattr(plan, name)[rows] = getattr(found, name)
+        put(plan, rows, found)
         plan.step[rows], plan.wait[rows] = 0, np.maximum(plan.wait[rows], found.wait)
 
     def _made(self, *arguments: Any) -> Future:
@@ -263,9 +262,8 @@ class MPC(Agent):
         bad = (old.wait == 0) & (first | self._ends_badly(found.states, found.actions, targets))
         if bad.any():
             other, gain = self._search(x[bad], targets[bad])
-            better = np.flatnonzero(bad)[gain > value[bad]]
-            for name in ("states", "actions", "gains"):
-                getattr(found, name)[better] = getattr(other, name)[gain > value[bad]]
+            better = gain > value[bad]
+            put(found, np.flatnonzero(bad)[better], other, better)
         return Ahead(none, np.where(bad, self.pause, 0), found.states, found.actions, found.gains)
 
     def _warm_up(self) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.controllers.basic import trait
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.scenes.derivation import layout_of
 from lag_envs.tasks import TASKS
@@ -52,13 +53,12 @@ class Condition:
         Parameters
         ----------
         agent : object
-            The agent. An agent with a `pace` counts steps and can be given their length; `of_one_interval`
-            says that its memory expects steps of one length.
+            The agent. An agent with a `pace` counts steps and can be given their length.
         plans : bool
             Whether the agent plans.
         """
-        of_one = plans or getattr(agent, "of_one_interval", False)
-        return "dt" not in self.options or hasattr(agent, "pace") or not of_one
+        of_one = plans or trait(agent, "of_one_interval")
+        return "dt" not in self.options or trait(agent, "pace") is not None or not of_one
 
 
 def often(env_id: str) -> Condition:

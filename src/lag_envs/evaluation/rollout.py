@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import at_random
+from lag_envs.controllers.basic import at_random, trait
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ class Rollout:
         self.envs = envs.unwrapped
         self.task: Task = self.envs.task
         self.agent, self.sensor, self.memory = agent, sensor, None
-        if hasattr(agent, "pace"):
+        if trait(agent, "pace") is not None:
             agent.pace = self.task.dt / self.task.interval
         self.observation, _ = self.envs.reset(seed=list(seeds))
         self.target: NDArray | None = None if self.envs.target is None else self.envs.target.copy()

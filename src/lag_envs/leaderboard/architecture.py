@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Agent
+from lag_envs.controllers.basic import Agent, Stateless
 from lag_envs.leaderboard.fields import Strict
 from lag_envs.tasks.base import Task
 
@@ -124,31 +124,27 @@ def feedback_data(agent: Agent, task: Task) -> PageData | None:
     return PageData({"kind": "plan", "read": law.read.numbers()}, arrays, Head(task))
 
 
-class Memoryless(Agent):
-    """Base of the agents without memory; a subclass defines `act`.
+class Memoryless(Stateless):
+    """An agent without memory.
 
     Parameters
     ----------
     head : Head
         Turns numbers into actions.
+    numbers : callable
+        Returns numbers (n, size) for the head, for observations (n, n_observation).
     """
 
-    def __init__(self, head: Head) -> None:
-        self.head = head
+    def __init__(self, head: Head, numbers: Callable[[Array], Array]) -> None:
+        self.head, self.numbers = head, numbers
 
-    @abstractmethod
-    def act(self, observations: Array) -> Array:
-        """Return numbers (n, size) for the head, for observations (n, n_observation)."""
-
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray, Any]:
+    def answer(self, observation: NDArray) -> NDArray:
         """Return the action for each observation."""
         values = np.asarray(observation, np.float64)
         # An overflow ends as a non-finite action, which verification refuses.
         with np.errstate(all="ignore"):
-            actions = self.head(self.act(np.atleast_2d(values)))
-        return actions.reshape((*values.shape[:-1], *actions.shape[1:])), state
+            actions = self.head(self.numbers(np.atleast_2d(values)))
+        return actions.reshape((*values.shape[:-1], *actions.shape[1:]))
 
 
 class Remembering(Agent):

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from lag_envs.leaderboard.log import (
     parse,
     read_log,
 )
-from lag_envs.leaderboard.pending import PendingCheck, finish
+from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.standings import board_data, page_data
 from lag_envs.options import count
 from lag_envs.tables import aligned
@@ -221,10 +222,8 @@ def _publish(board: Board, value: str | None, source: str) -> None:
     if value is None:
         value, source = head_of(board), COMMIT
     elif not source and len(value) in (40, 64):
-        try:
+        with suppress(BoardError):
             source = COMMIT if head_of(board) == value else ""
-        except BoardError:
-            pass
     board.publish(value, source)
     print(f"nonce: {value}")
     if not source:
@@ -253,7 +252,7 @@ def _finish(board: Board, args: argparse.Namespace) -> int:
     def tell(entry: BoardEntry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
 
-    def parallel_map(check: PendingCheck, folders: Sequence[Path]) -> Iterable[tuple[Path, Any]]:
+    def parallel_map(check: Callable[[Path], Any], folders: Sequence[Path]) -> Iterable[tuple[Path, Any]]:
         from tqdm import tqdm
 
         from lag_envs.leaderboard.parallel import map_submissions, with_bar

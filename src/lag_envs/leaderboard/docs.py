@@ -7,6 +7,7 @@ alone, so a test generates them again and compares.
 
 from __future__ import annotations
 
+import html
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,7 @@ def goals() -> str:
 
 def plain_markdown(text: str) -> str:
     """Return text that Markdown and HTML show as it is."""
-    escaped = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    escaped = html.escape(text, quote=False)
     return "".join("\\" + c if c in "\\`*_{}[]()#!~" else c for c in " ".join(escaped.split()))
 
 

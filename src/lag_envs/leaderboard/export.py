@@ -451,7 +451,7 @@ def export(
     """
     known = [s.result for s in sources if s.result]
     name = name or _name(sources[0], algo)
-    env = env or _same("environment", sources, "env")
+    env = env or _environment(sources)
     if env not in protocol.boards():
         raise ExportError(f"there is no environment {env!r}; {hint(env, protocol.boards())}")
     if os.path.lexists(folder):
@@ -501,13 +501,13 @@ def export(
     return submission, off, count
 
 
-def _same(what: str, sources: Sequence[Source], key: str) -> Any:
-    """Return what is noted under a key about the trainings."""
-    values = {source.result[key] for source in sources if source.result and key in source.result}
+def _environment(sources: Sequence[Source]) -> Any:
+    """Return the environment that is noted about the trainings."""
+    values = {source.result["env"] for source in sources if source.result and "env" in source.result}
     if not values:
-        raise ExportError(f"the {what} is not known; give --{key}")
+        raise ExportError("the environment is not known; give --env")
     if len(values) > 1:
-        raise ExportError(f"the models have more than one {what}: {', '.join(map(str, sorted(values)))}")
+        raise ExportError(f"the models have more than one environment: {', '.join(map(str, sorted(values)))}")
     return values.pop()
 
 
@@ -574,7 +574,7 @@ def run_export(args: argparse.Namespace) -> int:
                         raise _only_for_models(option, source)
         if args.frames is not None:
             sources = [replace(source, frames=args.frames) for source in sources]
-        known = args.env or _same("environment", sources, "env")
+        known = args.env or _environment(sources)
         name = args.name or _name(sources[0], args.algo)
         submission, off, count = export(
             sources, args.output or Path(f"{known}-{name}".replace(" ", "-").replace("/", "-")),

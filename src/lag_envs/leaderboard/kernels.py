@@ -27,7 +27,7 @@ def affine(x: Any, weight: Any, bias: Any) -> Any:
             f"a layer of weights {weight.shape} and biases {bias.shape} takes rows of {len(weight)} numbers, "
             f"got shape {x.shape}"
         )
-    return _affine(x, weight, bias)
+    return _affine(np.ascontiguousarray(x), weight, bias)
 
 
 @jit

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -274,7 +275,7 @@ class _Layers:
 
         x = features
         for k, (weight, bias) in enumerate(self.weights):
-            x = affine(np.ascontiguousarray(x), weight, bias)
+            x = affine(x, weight, bias)
             if k + 1 < len(self.weights):
                 x = self.f(x)
         return x
@@ -292,14 +293,15 @@ class _Layers:
             x = np.clip(x, -self.made.mean_limit, self.made.mean_limit)
         return self.head.largest * np.tanh(x) if self.made.squash == "tanh" else x
 
+    def decide(self, observations: Array) -> Array:
+        """Return numbers for the head, for observations that are not yet normalised."""
+        return self.numbers(self.normalised(observations))
+
 
 class _Feedforward(Memoryless):
     def __init__(self, layers: _Layers) -> None:
-        super().__init__(layers.head)
+        super().__init__(layers.head, layers.decide)
         self.layers = layers
-
-    def act(self, observations: Array) -> Array:
-        return self.layers.numbers(self.layers.normalised(observations))
 
 
 class _Stacked(Remembering):
@@ -315,7 +317,7 @@ class _Stacked(Remembering):
 
     def act(self, observations: Array, memories: Array) -> tuple[Array, Array]:
         seen = np.concatenate([memories[:, 1:], observations[:, None]], axis=1)
-        return self.layers.numbers(self.layers.normalised(seen.reshape(len(seen), -1))), seen
+        return self.layers.decide(seen.reshape(len(seen), -1)), seen
 
 
 class _Recurrent(Remembering):
@@ -335,8 +337,8 @@ class _Recurrent(Remembering):
     def act(self, observations: Array, memories: Array) -> tuple[Array, Array]:
         from lag_envs.leaderboard.kernels import affine
 
-        seen = affine(np.ascontiguousarray(self.layers.normalised(observations)), *self.seen)
-        kept = affine(np.ascontiguousarray(memories), *self.kept)
+        seen = affine(self.layers.normalised(observations), *self.seen)
+        kept = affine(memories, *self.kept)
         (r_o, z_o, n_o), (r_h, z_h, n_h) = (np.split(part, 3, axis=1) for part in (seen, kept))
         z = _sigmoid(z_o + z_h)
         memories = (1.0 - z) * np.tanh(n_o + _sigmoid(r_o + r_h) * n_h) + z * memories
@@ -359,22 +361,17 @@ class Linear(Architecture):
         count = self.head.size
         self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
 
-    def agent(self, arrays: Mapping[str, Array]) -> _LinearFeedback:
+    def agent(self, arrays: Mapping[str, Array]) -> Memoryless:
         """Return the feedback."""
-        return _LinearFeedback(self.head, arrays["gain"], arrays["offset"])
+        gain, offset = (np.ascontiguousarray(arrays[name]) for name in ("gain", "offset"))
+        return Memoryless(self.head, partial(_linear, gain.reshape(len(gain), -1), offset))
 
     def page_data(self, arrays: Mapping[str, Array]) -> PageData:
         """Return the arrays, which say everything."""
         return PageData({"kind": "linear"}, arrays, self.head)
 
 
-class _LinearFeedback(Memoryless):
-    def __init__(self, head: Head, gain: Array, offset: Array) -> None:
-        super().__init__(head)
-        self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))
-        self.offset = np.ascontiguousarray(offset)
+def _linear(gain: Array, offset: Array, observations: Array) -> Array:
+    from lag_envs.leaderboard.kernels import affine
 
-    def act(self, observations: Array) -> Array:
-        from lag_envs.leaderboard.kernels import affine
-
-        return affine(np.ascontiguousarray(observations), self.gain, self.offset)
+    return affine(observations, gain, offset)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,34 +17,37 @@ if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About, Submission
 
 
-@dataclass(frozen=True)
-class PendingCheck:
-    """Process a pending submission, here or on another machine.
+def check_pending(
+    entries: Mapping[str, tuple[str, str]], folder: Path, progress: Callable[[int, int], Any] | None = None
+) -> dict[str, Any]:
+    """Process a pending submission, here or on another machine; return the result for the board.
 
     Parameters
     ----------
-    entries : dict of str to (digest, nonce)
+    entries : mapping of str to (digest, nonce)
         The digest and nonce of each submission, by the name of its folder.
+    folder : Path
+        The submission.
+    progress : callable, optional
+        As for `verify`.
+
+    Raises
+    ------
+    Refused
+        If it is not acceptable.
     """
+    from lag_envs.leaderboard.alike import check_twins
+    from lag_envs.leaderboard.submission import Refused, load
+    from lag_envs.leaderboard.verify import verify
 
-    entries: Mapping[str, tuple[str, str]]
-
-    def __call__(self, folder: Path, progress: Callable[[int, int], Any] | None = None) -> dict[str, Any]:
-        """Return the result, with some recorded episodes; raise `Refused` if it is not acceptable."""
-        from lag_envs.leaderboard.alike import check_twins
-        from lag_envs.leaderboard.submission import Refused, load
-        from lag_envs.leaderboard.verify import verify
-
-        digest, nonce = self.entries[folder.name]
-        submission = load(folder)
-        if submission.digest != digest:
-            raise Refused("its files are not those that were added")
-        check_twins(submission, nonce)
-        result = verify(submission, nonce, protocol.EPISODES, progress)
-        # A result that the board cannot keep fails here, without harm to the others.
-        return checked_result(
-            result | {"claimed": claimed(submission), "replays": replays(submission, result)}
-        )
+    digest, nonce = entries[folder.name]
+    submission = load(folder)
+    if submission.digest != digest:
+        raise Refused("its files are not those that were added")
+    check_twins(submission, nonce)
+    result = verify(submission, nonce, protocol.EPISODES, progress)
+    # A result that the board cannot keep fails here, without harm to the others.
+    return checked_result(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
 
 
 def claimed(submission: About) -> dict[str, Any]:
@@ -58,10 +60,7 @@ def claimed(submission: About) -> dict[str, Any]:
         "env_steps": training.get("env_steps"),
         "seconds": training.get("seconds"),
         "hardware": training.get("hardware"),
-        "curves": [
-            {"seed": c["seed"], "steps": list(c["steps"]), "returns": list(c["returns"])}
-            for c in training.get("curves", ())
-        ],
+        "curves": training.get("curves", []),
     }
 
 
@@ -128,10 +127,10 @@ def finish(
                     reserved_here[entry.id] = entry, nonce
                     continue
             tell(entry, _outcome(board, entry))
-        work = PendingCheck({id: (entry.digest, nonce) for id, (entry, nonce) in reserved_here.items()})
+        entries = {id: (entry.digest, nonce) for id, (entry, nonce) in reserved_here.items()}
         folders = [board.submission(id) for id in reserved_here]
         neighbours = Neighbours(board)
-        for folder, result in (parallel_map or partial(map_submissions, jobs=1))(work, folders):
+        for folder, result in (parallel_map or map_submissions)(partial(check_pending, entries), folders):
             entry = reserved_here[folder.name][0]
             if isinstance(result, Refused):
                 board.rejected(entry.id, str(result))

@@ -248,16 +248,16 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     policies = result["policies"]
     bare = np.array([p["returns"] for p in policies], np.float64)
     means = scores.table.mean(axis=1)
-    settle, effort = (pooled(policies, name) for name in ("settle", "effort"))
+    settle, effort, success = (
+        [value for p in policies for value in p[name]] for name in ("settle", "effort", "success")
+    )
     goal = TASKS[env_id].goal if env_id in TASKS else None
-    success = pooled(policies, "success") if goal is None or goal.counted else []
     counted = None
-    if success:
+    if goal is None or goal.counted:
         low, high = wilson(sum(success), len(success))
         counted = {"rate": sum(success) / len(success), "low": low, "high": high}
     # Only the first episodes are disturbed: subtract how they differ from all even if undisturbed.
     moved = means - normalised(scale, bare[:, :few].mean(axis=1))
-    robustness = _scores(scale, result.get("robustness") or {}, moved)
     # With random kicks, acting more often draws different ones.
     often = 0.0 * moved if env_id in TASKS and TASKS[env_id]().draws else moved
     return {
@@ -265,24 +265,17 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
         "return": scale.random + float(means.mean()) * (scale.best - scale.random),
         "gap": optimality_gap(means),
         "success": counted,
-        "settle": median_time(settle) if settle else None,
-        "effort": float(np.mean(effort)) if effort else None,
-        "robustness": robustness,
-        "often": _scores(scale, {"often": result.get("often")}, often).get("often"),
+        "settle": median_time(settle),
+        "effort": float(np.mean(effort)),
+        "robustness": _scores(scale, result["robustness"], moved),
+        "often": _scores(scale, {"often": result["often"]}, often).get("often"),
         "profile": np.column_stack([THRESHOLDS, profile(normalised(scale, bare))]).round(5).tolist(),
     }
 
 
-def pooled(policies: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
-    """Return a quantity over all episodes of all policies; empty if it is not defined."""
-    return [value for p in policies for value in (p.get(name) or [])]
-
-
-def _scores(
-    scale: Scale, returns: Mapping[str, Sequence[float | None] | None], moved: Array
-) -> dict[str, float]:
+def _scores(scale: Scale, returns: Mapping[str, Sequence[float | None]], moved: Array) -> dict[str, float]:
     """Return the score under each condition, shifted; conditions that a policy did not play are left out."""
-    full = {name: each for name, each in returns.items() if each and None not in each}
+    full = {name: each for name, each in returns.items() if None not in each}
     if not full:
         return {}
     means = normalised(scale, np.array([*full.values()], np.float64)) + moved
