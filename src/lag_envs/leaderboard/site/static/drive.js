@@ -573,11 +573,11 @@ function open(root, board, code, tools) {
 
   /** Write the numbers. While they change they are painted, because laying out text takes a browser milliseconds. */
   function readOut(told) {
+    const { pen, width } = cleared(values);
     if (!running || readout.children.length !== told.length) {
       writeList(readout, told);
       places = null;
     }
-    const { pen, width } = cleared(values);
     if (running && width) {
       places ??= placesOf(readout);
       [pen.font, pen.fillStyle, pen.textBaseline] = [places.font, places.colour, "middle"];
