@@ -37,7 +37,9 @@ each_perfect_single = pytest.mark.parametrize("env_id", covering(i for i in SING
 IMPOSSIBLE = {
     PivotedBar: [
         {"mass": 0.0},
+        {"mass": -1.0},
         {"inertia": -1e-9},
+        {"damping": -0.1},
         {"gravity": math.inf},
         {"track": 0.0},
     ],
