@@ -389,16 +389,22 @@ function open(root, board, code, tools) {
 
   /** Keep the seed in the address, unless a link there already has it. */
   function note() {
-    if (seed !== linked?.seed) history.replaceState(null, "", `#seed=${seed}`);
+    const address = `#seed=${seed}`;
+    if (seed !== linked?.seed && location.hash !== address) history.replaceState(null, "", address);
   }
 
-  function restart() {
+  /** Go back to the start, which is not shown yet. */
+  function rewind() {
     me = new Episode(code, seed, constants);
     mine = [];
     [past, now] = [me.poses(), me.poses()];
     left = 0;
-    setLink("");
     startGhost();
+  }
+
+  function restart() {
+    rewind();
+    setLink("");
     if (running) note();
     label();
     show(1);
@@ -515,6 +521,8 @@ function open(root, board, code, tools) {
     if (running || loading()) return;
     running = true;
     tapped = null;
+    shownAt = 0;
+    show(1); // before anything is written, as the places of the numbers are asked for
     note();
     message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
       : waiting() ? `Time begins with your first ${touched ? "touch" : "key"}.` : "";
@@ -522,8 +530,17 @@ function open(root, board, code, tools) {
     setLink("");
     before = performance.now();
     label();
-    readOut(entries(ghostAt(0)));
     requestAnimationFrame(frame);
+  }
+
+  /** Drive from the start. */
+  function begin() {
+    if (running || loading()) {
+      restart();
+      return;
+    }
+    rewind();
+    run();
   }
 
   /** Pause or go on. An episode that has ended starts again, with the player at the controls. */
@@ -532,11 +549,12 @@ function open(root, board, code, tools) {
       pause();
       return;
     }
-    if (ended()) {
-      rerunning = null;
-      restart();
+    if (!ended()) {
+      run();
+      return;
     }
-    run();
+    rerunning = null;
+    begin();
   }
 
   function pause() {
@@ -765,8 +783,7 @@ function open(root, board, code, tools) {
 
   function afresh() {
     rerunning = null;
-    restart();
-    run();
+    begin();
   }
 
   function another() {
@@ -840,8 +857,7 @@ function open(root, board, code, tools) {
     reset.click();
     seed = linked.seed;
     rerunning = linked;
-    restart();
-    run();
+    begin();
     stage.focus({ preventScroll: true });
   });
   // After a choice by pointer the keys drive again; those who choose by keys stay where they are.
