@@ -453,7 +453,7 @@ function open(root, board, code, tools) {
     if (me.over) close();
   }
 
-  /** Stop. The final texts and the link wait for the next frames, because they lay out the page anew. */
+  /** Stop. Numbers, words and link wait for frames of their own, because each of them lays out the page anew. */
   function close(words = "") {
     const of = me;
     const later = (work) => () => {
@@ -461,13 +461,16 @@ function open(root, board, code, tools) {
     };
     running = false;
     requestAnimationFrame(later(() => {
-      finish(words);
-      idly(later(offer));
+      label();
+      readOut(entries(ghostAt(1)));
+      requestAnimationFrame(later(() => {
+        finish(words);
+        idly(later(offer));
+      }));
     }));
   }
 
   function finish(words) {
-    label();
     const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
     const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
     const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
@@ -506,8 +509,12 @@ function open(root, board, code, tools) {
       if (performance.now() > end) break;
     }
     if (left > about.dt) left = about.dt;
-    show(running ? left / about.dt : 1);
-    if (running) requestAnimationFrame(frame);
+    if (!running) {
+      draw(1);
+      return;
+    }
+    show(left / about.dt);
+    requestAnimationFrame(frame);
   }
 
   function label() {
@@ -569,6 +576,15 @@ function open(root, board, code, tools) {
   // --- display
 
   function show(part) {
+    draw(part);
+    // Numbers that change sixty times a second cannot be read, and cost more than the step.
+    const moment = performance.now();
+    if (running && moment - shownAt < 120) return;
+    shownAt = moment;
+    readOut(entries(ghostAt(part)));
+  }
+
+  function draw(part) {
     const { pen, width, height } = cleared(canvas);
     if (width && picture && about.frames) {
       const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
@@ -582,11 +598,6 @@ function open(root, board, code, tools) {
         pen.globalAlpha = 1;
       }
     }
-    // Numbers that change sixty times a second cannot be read, and cost more than the step.
-    const moment = performance.now();
-    if (running && moment - shownAt < 120) return;
-    shownAt = moment;
-    readOut(entries(ghostAt(part)));
   }
 
   /** Write the numbers. While they change they are painted, because laying out text takes a browser milliseconds. */
