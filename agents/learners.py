@@ -73,11 +73,11 @@ class Entry(NamedTuple):
 CONTINUOUS, DISCRETE = "continuous actions", "one discrete action"
 #: Learners of Stable-Baselines3. DQN splits a continuous control into bins, see `make_envs`.
 ALGORITHMS = {
-    "ppo": Entry("stable_baselines3", "PPO"),
-    "sac": Entry("stable_baselines3", "SAC", CONTINUOUS, keeps_best=True),
-    "td3": Entry("stable_baselines3", "TD3", CONTINUOUS, keeps_best=True),
-    "dqn": Entry("stable_baselines3", "DQN", DISCRETE, keeps_best=True),
-    "tqc": Entry("sb3_contrib", "TQC", CONTINUOUS, keeps_best=True),
+    "ppo": Entry(*export.ALGORITHMS["ppo"][:2]),
+    "sac": Entry(*export.ALGORITHMS["sac"][:2], CONTINUOUS, keeps_best=True),
+    "td3": Entry(*export.ALGORITHMS["td3"][:2], CONTINUOUS, keeps_best=True),
+    "dqn": Entry(*export.ALGORITHMS["dqn"][:2], DISCRETE, keeps_best=True),
+    "tqc": Entry(*export.ALGORITHMS["tqc"][:2], CONTINUOUS, keeps_best=True),
 }
 #: Learners of our own, in the modules that train them.
 OWN = {
@@ -244,8 +244,9 @@ def check_suits(algo: str, env_id: str) -> None:
     task = make_task(env_id)
     if not suits(algo, task):
         fit, needs = ", ".join(name for name in LEARNERS if suits(name, task)), LEARNERS[algo].needs
-        several = "several" if task.formulas.actions > 1 else "a continuous one"
-        has = "discrete ones" if needs == CONTINUOUS else several
+        has = "discrete ones"
+        if needs == DISCRETE:
+            has = "several" if task.formulas.actions > 1 else "a continuous one"
         raise UserError(f"{algo} needs {needs}; {env_id} has {has}; available: {fit}")
 
 

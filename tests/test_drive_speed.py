@@ -40,7 +40,7 @@ NETWORK = {"architecture": "mlp", "hidden": [256, 256], "activation": "relu", "s
 def test_a_frame_takes_eight_milliseconds_at_most(drive, id, ghost, tmp_path):
     """In at least one of three drives, as the machine may be busy; that lengthens painting most of all.
 
-    Of whole frames a tenth may take longer: where episodes are short, so many begin and end one.
+    A tenth of the whole frames may take longer: short episodes start or end in that many.
     """
     data = board_pages.data((id,), board_pages.AGENTS[:1])
     if ghost:
