@@ -73,7 +73,7 @@ examples:
   python -m agents.train PivotedBar-v0 --algo sac td3 --seeds 5
   python -m agents.train examples/ball_on_beam.py               a task of your own; this runs the file
   python -m agents.train all --algo ppo fast_ppo sac td3 tqc dqn --seeds 5   the runs behind docs/agents.md
-  python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   a hundred seeds, spread over a Ray cluster
+  python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   a hundred seeds, on a Ray cluster
 """
 
 

@@ -5,6 +5,7 @@ would be there. A scene with its task is also one file: `toy_pendulum.py`.
 """
 
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -77,6 +78,14 @@ def scaled(task, tmp_path, monkeypatch):
     assert scale.main([ID, "--batches", "1", "--output", str(path)]) == 0
     monkeypatch.setattr(measured, "FILE", path)
     return known_returns(ID)
+
+
+@pytest.mark.parametrize("command", [["check"], ["format", "--check"]], ids=" ".join)
+def test_ruff_has_nothing_to_say(command):
+    place = ["--stdin-filename", "src/lag_envs/tasks/two_link_arm.py", "-"]
+    ruff = [sys.executable, "-m", "ruff", *command, *place]
+    told = subprocess.run(ruff, cwd=ROOT, input=CODE, text=True, encoding="utf-8", capture_output=True)
+    assert told.returncode == 0, told.stdout
 
 
 def test_environment(task):

@@ -165,11 +165,22 @@ def test_start_table(env_id, page):
     found = rows(page, "Starting State", "Entry")
     envs = gym.make_vec(env_id, num_envs=2000)
     envs.reset(seed=0)
-    for name, starts in zip(task.scene.state_names, np.asarray(envs.unwrapped.state).T, strict=True):
+    boxes = task.formulas.target_boxes
+    names = [*task.scene.state_names, *(box.name for box in boxes)]
+    columns = [*envs.unwrapped.state.T, *(np.reshape(envs.unwrapped.target, (2000, -1)).T if boxes else ())]
+    for name, starts in zip(names, columns, strict=True):
         centre, half = float(found[name]["Centre"]), float(found[name]["To either side"])
         assert np.ptp(starts) == pytest.approx(2.0 * half, rel=0.01, abs=1e-12), name
         assert starts.mean() == pytest.approx(centre, abs=0.05 * half + 1e-4), name
+    assert [found[name]["Unit"] for name in names] == [*task.scene.state_units, *(box.unit for box in boxes)]
     assert ("kick" in sections(page)["Starting State"]) == bool(task.draws)
+
+
+@each_id
+def test_episode_length(env_id, page):
+    task = make(env_id).task
+    end = f"after {task.limit:g} steps ({task.limit * task.dt:g} s)"
+    assert end in sections(page)["Episode End"]
 
 
 @each_id
@@ -186,6 +197,8 @@ def test_argument_table(env_id, page):
     for name in names:
         value, default = getattr(again.scene, name), getattr(task.scene, name)
         assert value == (pytest.approx(default, rel=1e-4) if isinstance(default, float) else default), name
+    for field in dataclasses.fields(task.scene):
+        assert found[field.name]["Unit"] == field.metadata.get("unit", ""), field.name
     assert again.limit == task.limit
     assert "-∞" not in page.partition("## Arguments")[2].partition("## ")[0]
     positive = [name for name, row in found.items() if row["Range"].startswith(("above 0", "at least 0"))]

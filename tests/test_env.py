@@ -240,6 +240,14 @@ def test_any_seed(seed):
     assert env.np_random_seed == seed
 
 
+@pytest.mark.parametrize("seed", [-1, 1.5, "one"])
+def test_refused_seeds_leave_the_environment_as_it_was(seed):
+    env, twin = running_twins(pivoted_bar.Balance.id)  # its kicks are random
+    with pytest.raises((TypeError, ValueError), match="seed must be "):
+        env.reset(seed=seed)
+    assert trace(env, actions(200, 1)) == trace(twin, actions(200, 1))
+
+
 @each_id
 @pytest.mark.parametrize(
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]

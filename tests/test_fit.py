@@ -533,4 +533,4 @@ def test_noise_alone_determines_nothing(free):
         states = np.column_stack([np.pi + noise, np.full(100, np.nan)])
         with pytest.warns(FitWarning) as seen:
             Pendulum(mass=0.12, length=0.7, damping=0.004).fit([(states, None, 0.04)], free=free)
-        assert any("the motion hardly stands out of the noise" in str(w.message) for w in seen)
+        assert any("the motion hardly stands out from the noise" in str(w.message) for w in seen)

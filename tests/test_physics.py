@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -338,6 +339,14 @@ def test_many_states():
         for key, values in many.items():
             assert values.shape == (2, 5)
             assert values[1, 3] == pytest.approx(float(method(states[1, 3], u[3])[key]), rel=1e-14)
+
+
+@pytest.mark.parametrize(("state", "shape"), [([1.0], "(1,)"), (np.zeros((2, 4)), "(2, 4)"), (3.0, "()")])
+def test_states_of_another_shape_are_refused(state, shape):
+    bar = PivotedBar(track=None)
+    for method in (bar.energy, bar.forces, bar.power):
+        with pytest.raises(ValueError, match=re.escape(f"(theta, theta_dot), got shape {shape}")):
+            method(state)
 
 
 def test_step_bound():

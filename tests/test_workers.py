@@ -14,7 +14,7 @@ from covering import slow
 from pebble.pool.process import WorkerManager
 
 from lag_envs import workers
-from lag_envs.workers import SpreadError, as_they_finish, check_address, died, processes
+from lag_envs.workers import ClusterError, as_they_finish, check_address, died, processes
 
 HERE = Path(__file__).parents[1]
 greeting = ""
@@ -165,7 +165,7 @@ def test_a_cluster_that_does_not_start(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
     with (
-        pytest.raises(SpreadError, match="no Ray cluster at 'local': The current node"),
+        pytest.raises(ClusterError, match="no Ray cluster at 'local': The current node"),
         workers.cluster("local"),
     ):
         pass
@@ -173,8 +173,8 @@ def test_a_cluster_that_does_not_start(monkeypatch):
 
 def test_a_missing_cluster_is_named(monkeypatch):
     for address in ("127.0.0.1:1", "ray://127.0.0.1:1", "host:port"):
-        with pytest.raises(SpreadError, match="no Ray cluster at"):
+        with pytest.raises(ClusterError, match="no Ray cluster at"):
             check_address(address)
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(SpreadError, match=r"pip install 'lag-envs\[ray\]'"), workers.cluster("local"):
+    with pytest.raises(ClusterError, match=r"pip install 'lag-envs\[ray\]'"), workers.cluster("local"):
         pass

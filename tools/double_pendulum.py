@@ -17,14 +17,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-import lag_envs  # noqa: F401 (registers the ids)
 from lag_envs.controllers import make_controller
 from lag_envs.mechanics.recording import parameter_values
 from lag_envs.options import module_parser
+from lag_envs.tasks import Task
+from lag_envs.tasks.acrobot import AcrobotReal, PendubotReal
 
 MODEL = Path("data/system_identification/identified_parameters/design_C.1/model_1.0/model_parameters.yml")
-#: The driven joint.
-ROBOTS = {"AcrobotReal-v0": 1, "PendubotReal-v0": 0}
+ROBOTS: tuple[type[Task], ...] = (AcrobotReal, PendubotReal)
 #: The order of lag_envs's state entries in the project's state (angles, rates).
 ORDER = [0, 2, 1, 3]
 START = [np.pi + 0.05, -0.03, 0.0, 0.0]
@@ -43,30 +43,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (args.checkout / MODEL).is_file():
         parser.error(f"{args.checkout} has no {MODEL}; give a checkout of the project")
     sys.path.insert(0, str(args.checkout / "src" / "python"))
-    good = [check(env_id, joint, args.checkout) for env_id, joint in ROBOTS.items()]
+    good = [check(robot, args.checkout) for robot in ROBOTS]
     return 0 if all(good) else 1
 
 
-def check(env_id: str, joint: int, checkout: Path) -> bool:
+def check(robot: type[Task], checkout: Path) -> bool:
     """Compare one task with the project's plant, simulator and LQR, and print and check the results."""
     from double_pendulum.analysis.leaderboard import get_swingup_time  # type: ignore[import-not-found]
     from double_pendulum.model.model_parameters import model_parameters  # type: ignore[import-not-found]
     from double_pendulum.model.plant import DoublePendulumPlant  # type: ignore[import-not-found]
     from double_pendulum.simulation.simulation import Simulator  # type: ignore[import-not-found]
 
-    env: Any = gym.make(env_id).unwrapped
+    env: Any = gym.make(robot.id).unwrapped
+    # Both motors and all friction are used: the project compensates the idle joint's friction by the idle
+    # motor, while lag_envs leaves this friction out.
+    names = parameter_values(env.scene)
+    whole = type(env.scene)(control="both", **(names | FRICTION))
+    (joint,) = (whole.control_names.index(name) for name in robot.action)
     model = model_parameters(filepath=str(checkout / MODEL))
     limits = [IDLE, IDLE]
     limits[joint] = float(env.task.limit_control)
     model.set_torque_limit(limits)
     plant = DoublePendulumPlant(model_pars=model)
-    # Both motors and all friction are used: the project compensates the idle joint's friction by the idle
-    # motor, while lag_envs leaves this friction out.
-    names = parameter_values(env.scene)
-    whole = type(env.scene)(control="both", **(names | FRICTION))
 
     worst = accelerations(whole, plant)
-    print(f"{env_id}: accelerations at 10,000 random states agree to {worst:.1e} of the largest")
+    print(f"{robot.id}: accelerations at 10,000 random states agree to {worst:.1e} of the largest")
 
     simulator = Simulator(plant=plant)
     times, states, torques = simulator.simulate(
@@ -80,7 +81,7 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
 
     own_path, their_time = [np.array(START)[ORDER]], swing(get_swingup_time, times, path, model)
     observation, _ = env.reset(seed=0, options={"state": own_path[0]})
-    agent, memory, over, total = make_controller(env_id, "LQR"), None, False, 0.0
+    agent, memory, over, total = make_controller(robot.id, "LQR"), None, False, 0.0
     while not over:
         action, memory = agent.predict(observation, memory)
         observation, reward, terminated, truncated, _ = env.step(action)

@@ -29,8 +29,8 @@ Submit = Callable[..., Future]
 Key = TypeVar("Key")
 
 
-class SpreadError(UserError):
-    """The work cannot be spread; the text says why, and what to do."""
+class ClusterError(UserError):
+    """There is no cluster to work on; the text says why, and what to do."""
 
 
 def as_they_finish(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
@@ -179,13 +179,13 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
 
     Raises
     ------
-    SpreadError
+    ClusterError
         If Ray or its cluster is missing.
     """
     try:
         import ray
     except ImportError as error:
-        raise SpreadError("--ray needs Ray: pip install 'lag-envs[ray]'") from error
+        raise ClusterError("--ray needs Ray: pip install 'lag-envs[ray]'") from error
 
     check_address(address)
     packages = {"py_modules": [str(folder) for folder in (Path(__file__).parent, *modules)]}
@@ -195,7 +195,7 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
             log_to_driver=False,
         )  # fmt: skip
     except Exception as error:  # raised as such if a busy machine's node does not start in time
-        raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
+        raise ClusterError(f"no Ray cluster at {address!r}: {error}") from error
 
     def submit(function: Callable, *args: Any) -> Future:
         return ray.remote(num_cpus=1, max_retries=1)(function).remote(*args).future()
@@ -207,13 +207,13 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
 
 
 def check_address(address: str) -> None:
-    """Raise SpreadError if nothing listens at the address: Ray itself would try for minutes."""
+    """Raise ClusterError if nothing listens at the address: Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host:
         try:
             socket.create_connection((host, int(port)), timeout=10.0).close()
         except (OSError, ValueError, OverflowError) as error:
-            raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
+            raise ClusterError(f"no Ray cluster at {address!r}: {error}") from error
 
 
 # --- one process that keeps its results when it is stopped --------------------------------------------------

@@ -177,7 +177,7 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
 
     def crossing(place: Array, speed: Array, force: FixedSlope) -> tuple[Array, Array]:
-        """Return the time and speed at which 0 is passed, by integrating x'' = pull - drag x'."""
+        """Return time and speed at 0, by integrating x'' = acceleration - damping_rate x'."""
         time = crossing_time(place, speed, force, np.inf, np)
         return time, speed + force.acceleration * time + force.damping_rate * place
 

@@ -156,8 +156,8 @@ class AdaptiveEnergyShapingLQR(Agent):
         If no length is drawn, or actions are not late by a whole number of control steps.
     """
 
-    #: Largest γ [1/s] that is plausible, and the weight of the prior value 0.
-    LARGEST_FRICTION, SPREAD = 3.0, 0.3
+    #: Largest plausible γ [1/s], and the standard deviation of its prior about 0.
+    LARGEST_FRICTION, PRIOR_STD = 3.0, 0.3
 
     def __init__(
         self,
@@ -221,7 +221,7 @@ class AdaptiveEnergyShapingLQR(Agent):
     def _begin(self, x: Array) -> Estimate:
         """Return the estimate before anything has moved."""
         n, middle, half = len(x), 0.5 * (self.q[0] + self.q[-1]), 0.5 * (self.q[-1] - self.q[0])
-        sure = np.array([1.0 / half**2, 1.0 / self.SPREAD**2])
+        sure = np.array([1.0 / half**2, 1.0 / self.PRIOR_STD**2])
         return Estimate(
             x,
             np.zeros(n),
@@ -236,8 +236,8 @@ class AdaptiveEnergyShapingLQR(Agent):
         """Return the estimate after the states x have been observed."""
         old, u = known.seen, known.applied
         turned = np.remainder(x[:, 2] - old[:, 2] + math.pi, 2.0 * math.pi) - math.pi
-        pull = -0.5 * self.task.dt * (self._pull(old, u) + self._pull(x, u))
-        faded = self.fade * known.faded + np.stack([pull, -turned, x[:, 3] - old[:, 3]], axis=-1)
+        integral = -0.5 * self.task.dt * (self._tangential(old, u) + self._tangential(x, u))
+        faded = self.fade * known.faded + np.stack([integral, -turned, x[:, 3] - old[:, 3]], axis=-1)
         by = faded[:, :2]
         return known._replace(
             seen=x,
@@ -246,7 +246,8 @@ class AdaptiveEnergyShapingLQR(Agent):
             weighed=known.weighed + self.weight * by * faded[:, 2:],
         )
 
-    def _pull(self, x: Array, u: Array) -> Array:
+    def _tangential(self, x: Array, u: Array) -> Array:
+        """Return the tangential part of the field in the support's frame, g sinθ + u cosθ."""
         return self.task.scene.gravity * np.sin(x[:, 2]) + u * np.cos(x[:, 2])
 
     def _guarded(self, u: Array, x: Array) -> Array:
@@ -259,7 +260,7 @@ class AdaptiveEnergyShapingLQR(Agent):
         dt = self.task.dt
 
         def slope(y: Array) -> Array:
-            return np.stack([y[:, 1], u, y[:, 3], -q * self._pull(y, u) - friction * y[:, 3]], axis=-1)
+            return np.stack([y[:, 1], u, y[:, 3], -q * self._tangential(y, u) - friction * y[:, 3]], axis=-1)
 
         return x + dt * slope(x + 0.5 * dt * slope(x))
 

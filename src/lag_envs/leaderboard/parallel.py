@@ -40,7 +40,7 @@ def map_submissions(
 
     Raises
     ------
-    SpreadError
+    ClusterError
         From `lag_envs.workers`, if Ray or its cluster is missing.
     """
     if ray is not None:

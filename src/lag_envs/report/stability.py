@@ -91,7 +91,7 @@ def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
 
 
 def extreme_errors(names: Sequence[str]) -> Iterator[Row]:
-    """Yield the outcomes of the named stiff and extreme cases, beside the comparison integrators."""
+    """Yield the outcomes of the named stiff and extreme cases, and those of the comparison integrators."""
     for name in names:
         row: Row = {"kind": "case", "name": name, "peers": {}}
         try:

@@ -102,5 +102,5 @@ class CartPole(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return the poses of the rail, which shows no end, and of the arrow."""
+        """Return the poses of the rail, which is drawn without ends, and of the arrow."""
         return {"rail": (now.q.x, 0.0), "push": (now.q.x, 0.0, -0.5 * math.pi, now.share.force)}

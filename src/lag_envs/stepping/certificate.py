@@ -113,7 +113,7 @@ class Certificate:
         return passed, self._bounds
 
     def factor(self) -> Any:
-        """Return the part that will probably be certified of a step that has just failed the check."""
+        """Return which part of a step that has just failed the check will probably be certified."""
         t = self._t
         # Bounds grow with the power N + 1 of the step. Where there are no bounds, the last terms serve in
         # their place.

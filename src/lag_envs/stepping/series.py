@@ -60,11 +60,11 @@ def check_order(name: str, value: Any) -> int:
 def following(t: Target, order: Any) -> tuple[Any, Any]:
     """Return the weights with which the terms of a derivative's series estimate what follows the last.
 
-    The last term counts with the first weight, each earlier one with the second times that of the next. A
-    series of which 1e-13 is left out has terms that shrink by 1e-13^(1/(N+1)), which is 0.0172 (N - 6) within
-    5 % for N from 8 to 24. The term that follows is smaller than the last by this factor. If the last terms
-    are 0 because the series has gaps, earlier ones count instead, with lower weights: later terms shrink
-    faster.
+    The first is the last term's weight, the second the ratio of each earlier term's weight to that of the
+    term after it. A series of which 1e-13 is left out has terms that shrink by 1e-13^(1/(N+1)), which is
+    0.0172 (N - 6) within 5 % for N from 8 to 24. The term that follows is smaller than the last by this
+    factor. If the last terms are 0 because the series has gaps, earlier ones count instead, with lower
+    weights: later terms shrink faster.
     """
     first = t.mul(t.number(0.0172), t.sub(t.real(order), t.number(6.0)))
     least = t.number(0.015)

@@ -443,7 +443,7 @@ than its critics, it soon brakes fully everywhere, and never stops doing so.
         """Return the time to the line, and the speed there."""
         force = self.coefficients(before, control, xp)
         time = slope.crossing_time(before.x, before.x_dot, force, dt, xp)
-        # Integrating x'' = pull - drag x' up to the line gives the speed there.
+        # Integrating x'' = acceleration - damping_rate x' up to the line gives the speed there.
         return time, before.x_dot + force.acceleration * time + force.damping_rate * before.x
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:

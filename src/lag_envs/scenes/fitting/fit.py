@@ -330,8 +330,8 @@ def _doubt_of_motion(fitted: Fit, sizes: _Sizes) -> list[str]:
     if strength >= 2.0 * math.log(sizes.count) + 10.0:
         return []
     return [
-        "the motion hardly stands out of the noise, so the estimates may follow the noise: measure a larger "
-        "motion"
+        "the motion hardly stands out from the noise, so the estimates may follow the noise: measure a "
+        "larger motion"
     ]
 
 
