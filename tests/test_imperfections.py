@@ -20,7 +20,7 @@ from lag_envs.envs.imperfect.constants import constants_of
 from lag_envs.envs.imperfect.draws import PURPOSES
 from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.imperfect.whole import WholeProgram
-from lag_envs.envs.program import Program
+from lag_envs.envs.program import BLOCK, Program
 from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.leaderboard.site import driving
@@ -57,8 +57,8 @@ def test_what_divides_no_step_single_and_vector(mode, lag):
 
 @pytest.mark.slow
 def test_every_place_in_a_batch_has_the_same_bits():
-    lanes = [0, 3, 190, 191, 192, 249]
-    many = gym.make_vec(ID, num_envs=250, duration=0.4, **WHOLE)
+    lanes, count = [0, 3, BLOCK - 2, BLOCK - 1, BLOCK, BLOCK + 57], BLOCK + 58
+    many = gym.make_vec(ID, num_envs=count, duration=0.4, **WHOLE)
     few = gym.make_vec(ID, num_envs=len(lanes), duration=0.4, **WHOLE)
     assert np.array_equal(many.reset(seed=5)[0][lanes], few.reset(seed=[5 + i for i in lanes])[0])
     many.action_space.seed(0)
@@ -67,7 +67,7 @@ def test_every_place_in_a_batch_has_the_same_bits():
         for a, b in zip(many.step(actions)[:4], few.step(actions[lanes])[:4], strict=True):
             assert np.array_equal(a[lanes], b)
         if step == 30:
-            mask = np.arange(250) % 3 == 0
+            mask = np.arange(count) % 3 == 0
             a = many.reset(options={"reset_mask": mask})[0]
             assert np.array_equal(a[lanes], few.reset(options={"reset_mask": mask[lanes]})[0])
 
