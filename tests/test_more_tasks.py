@@ -7,7 +7,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering, every, slow
+from covering import every, slow
 from rollouts import Noisy, actions, episode, make
 
 from lag_envs.controllers import ILQR, build, make_controller
@@ -54,18 +54,18 @@ def reach(y, u, target):
     return math.exp(-np.linalg.norm(hand - target) / 0.1) * effort
 
 
-REWARDS = {
-    CartPoleSwingUp.id: cart_swing,
-    CartPoleContinuous.id: cart_balance,
-    RotarySwingUp.id: rotary,
-    AcrobotReal.id: real,
-    PendubotReal.id: real,
-    Reach.id: reach,
-}
-
-
-@pytest.mark.parametrize("env_id", covering(REWARDS))
-def test_rewards_are_as_written_and_never_below_0(env_id):
+@pytest.mark.parametrize(
+    ("env_id", "restated"),
+    [
+        (CartPoleSwingUp.id, cart_swing),
+        (CartPoleContinuous.id, cart_balance),
+        (Reach.id, reach),
+        slow(RotarySwingUp.id, rotary),
+        slow(AcrobotReal.id, real),
+        slow(PendubotReal.id, real),
+    ],
+)
+def test_rewards_are_as_written_and_never_below_0(env_id, restated):
     env = make(env_id)
     env.reset(seed=1)
     for i, action in enumerate(actions(300, env.action_space)):
@@ -74,7 +74,7 @@ def test_rewards_are_as_written_and_never_below_0(env_id):
         before = env.state
         _, reward, terminated, _, _ = env.step(action)
         after = env.scene.simulate(before, [np.atleast_1d(env.control)], env.task.dt)[1]
-        assert reward == pytest.approx(REWARDS[env_id](after, env.control, env.target), rel=1e-9, abs=1e-12)
+        assert reward == pytest.approx(restated(after, env.control, env.target), rel=1e-9, abs=1e-12)
         assert reward >= 0.0
         if terminated:
             env.reset()
@@ -132,11 +132,13 @@ def test_singular_starts_are_no_exception(env_id, state):
     assert np.abs(task.scene.jacobian(near[0], task.wanted(actions)[0], task.dt)[0]).max() < 10.0
 
 
-def test_easy_entries_are_no_gift():
-    """Random actions and idling get next to nothing of the possible return."""
-    for env_id in REWARDS:
-        known = known_returns(env_id)
-        assert known.random < 0.1 * known.best
+@pytest.mark.parametrize(
+    "kind", [CartPoleSwingUp, CartPoleContinuous, Reach, RotarySwingUp, AcrobotReal, PendubotReal]
+)
+def test_easy_entries_are_no_gift(kind):
+    """Random actions get next to nothing of the possible return."""
+    known = known_returns(kind.id)
+    assert known.random < 0.1 * known.best
 
 
 # --- the arm ---
