@@ -431,8 +431,9 @@ def parser() -> argparse.ArgumentParser:
         field = Settings.model_fields[name]
         kind: Any = {float: float, bool: yes_or_no}.get(field.annotation, int)
         many: Any = {"nargs": "+"} if get_origin(field.annotation) is list else {}
+        shown = "yes|no" if kind is yes_or_no else "X"
         group.add_argument(
-            "--" + name.replace("_", "-"), type=kind, metavar="X", help=field.description, **many
+            "--" + name.replace("_", "-"), type=kind, metavar=shown, help=field.description, **many
         )
     return p
 

@@ -17,6 +17,7 @@ from lag_envs.scenes.fitting import fit
 from lag_envs.scenes.fitting.parameters import FreeParameters
 from lag_envs.scenes.fitting.recordings import doubtful_rates, doubtful_units, recordings_of
 from lag_envs.scenes.fitting.result import FitWarning
+from lag_envs.scenes.fitting.shooting import Shooting
 from tools.docs import fit as docs
 
 DT = 0.04
@@ -424,6 +425,20 @@ def test_an_interval_in_milliseconds():
     told = r"a step of recording 0 lasts 40 s and needs \d{4} substeps, .* not in seconds, convert it"
     with pytest.warns(FitWarning, match=told), pytest.raises(ValueError, match="too few"):
         Pendulum().fit([(states[:2], torques[:1], 1e3 * DT)], list(ROD))
+
+
+def test_a_search_that_takes_long_is_cut_short(monkeypatch):
+    """Otherwise it would take minutes; and after one that has not converged, none takes as long again."""
+    monkeypatch.setattr("lag_envs.scenes.fitting.recordings.LONG", 0)  # these steps count as long
+    monkeypatch.setattr(fit, "LONGEST_SLOW", 3)
+    (states, torques), searches, solve = swings(), [], Shooting.solve
+    monkeypatch.setattr(Shooting, "solve", lambda *a, **k: searches.append(solve(*a, **k)) or searches[-1])
+    with pytest.warns(FitWarning) as seen:
+        Pendulum().fit([(noisy(states, [0.02, 0.1], 9), torques, DT)], list(ROD))
+    texts = " ".join(str(w.message) for w in seen)
+    assert "will take long" in texts and "ended before it converged" in texts
+    counts = [search.nfev for search in searches]
+    assert max(counts) == 3 and counts[-1] == 1
 
 
 def test_without_bound():

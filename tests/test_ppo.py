@@ -370,6 +370,10 @@ def test_mistakes_are_named(given, message, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_help_names_the_values_of_a_switch():
+    assert "--state-noise yes|no" in ppo.parser().format_help()
+
+
 def test_settings_of_another_kind_are_refused():
     good = zoo_hyperparameters(ppo.NAME, ENV)
     for changes, message in (

@@ -12,6 +12,7 @@ from mpmath import mp, mpf
 from rollouts import actions, make
 
 from lag_envs.controllers import Constant, Random, make_controller
+from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.registration import make_task
@@ -549,6 +550,16 @@ def test_the_way_to_the_line_is_paid_by_the_second():
         assert sum(rewards) == pytest.approx(
             -math.sqrt(2 / pull) - 5 * (math.sqrt(2 * pull) - 0.5), rel=1e-12
         )
+
+
+def test_from_on_or_behind_the_line_it_is_crossed_at_once():
+    """No episode starts there, but planners and `lag_envs.torch.Step` may step from any state."""
+    model, states = Model(make(incline.Brake.id).task), [[0.0, 0.0], [0.0, 2.0], [0.1, 0.0], [0.1, 2.0]]
+    _, rewards, ended = model(states, [0.3] * 4)
+    assert ended.all()
+    np.testing.assert_allclose(rewards, [0.0, -7.5, 0.0, -7.5], atol=1e-14)
+    slopes = model.vjp(states, [0.3] * 4, by_rewards=1.0).states
+    np.testing.assert_allclose(slopes[1::2], [[0.0, -5.0]] * 2)
 
 
 # --- known returns ---

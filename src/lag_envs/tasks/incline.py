@@ -395,7 +395,7 @@ class Brake(Task):
         },
     }  # fmt: skip
     value_iteration = ValueIteration(
-        # At rest on the line the time to the crossing is 0/0, so the grid ends just before it.
+        # On the line the episode is over, so the grid ends just before it.
         (
             Axis("x [m]", -3.0, -1e-6, 80, scale=0.3, centre=-1e-6, level=4),
             Axis("x' [m/s]", 0.0, 3.4, 80, scale=0.5, centre=0.5, level=4),
@@ -440,11 +440,12 @@ than its critics, it soon brakes fully everywhere, and never stops doing so.
         return -dt
 
     def crossing(self, before: Any, control: Any, dt: Any, xp: Any) -> tuple[Any, Any]:
-        """Return the time to the line, and the speed there."""
+        """Return the time to the line, and the speed there; from behind the line, those at the line."""
         force = self.coefficients(before, control, xp)
-        time = slope.crossing_time(before.x, before.x_dot, force, dt, xp)
+        place = xp.minimum(before.x, -1e-30)  # at rest on the line, the time would be 0/0
+        time = slope.crossing_time(place, before.x_dot, force, dt, xp)
         # Integrating x'' = acceleration - damping_rate x' up to the line gives the speed there.
-        return time, before.x_dot + force.acceleration * time + force.damping_rate * before.x
+        return time, before.x_dot + force.acceleration * time + force.damping_rate * place
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return minus the time to the line, minus the price of excess speed there."""

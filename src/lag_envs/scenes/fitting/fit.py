@@ -26,7 +26,7 @@ from lag_envs.scenes.fitting.recordings import (
     recordings_of,
 )
 from lag_envs.scenes.fitting.result import Fit, FitWarning
-from lag_envs.scenes.fitting.shooting import Shooting, cut
+from lag_envs.scenes.fitting.shooting import LONGEST, LONGEST_SLOW, Shooting, cut
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
@@ -79,8 +79,8 @@ def fit(
         raise ValueError(f"level must be between 0 and 1, got {level:g}")
     data = recordings_of(scene, recordings)
     sizes, parameters = _Sizes(scene, data, noise), FreeParameters(scene, names)
-    doubts = doubtful_units(scene, data) + doubtful_rates(scene, data)
-    doubts += doubtful_interval(parameters.scene(parameters.start), data, sizes.guesses)
+    slow = doubtful_interval(parameters.scene(parameters.start), data, sizes.guesses)
+    doubts = doubtful_units(scene, data) + doubtful_rates(scene, data) + slow
     for text in doubts:  # now, for the search would be long and may fail
         warnings.warn(text, FitWarning, stacklevel=3)
     unknowns = len(names) + len(data) * len(scene.state_names)
@@ -90,7 +90,7 @@ def fit(
             f"{unknowns - len(names)} entries of the starts of {len(data)} recordings; record longer"
         )
     try:
-        shooting, z = _approach(parameters, data, sizes)
+        shooting, z = _approach(parameters, data, sizes, LONGEST_SLOW if slow else LONGEST)
         relaxed = sizes.noise.copy()
         for part in CLOSING:
             shooting = shooting.weighed(sizes.noise, part * sizes.gap)
@@ -102,6 +102,8 @@ def fit(
             sizes.estimate(shooting, z, known.leverage)
             if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
                 break
+            if not found.success:
+                shooting.longest = 1  # another search would take as long; only the noise is estimated
     except StepRefused as error:
         raise _explained(error, scene, data, sizes) from error
     return _result(shooting, found, known, sizes, relaxed, level, doubts)
@@ -171,7 +173,9 @@ class _Sizes:
             self.noise[i] = max(sigma, LEAST_NOISE * self.range[i])
 
 
-def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) -> tuple[Shooting, Array]:
+def _approach(
+    parameters: FreeParameters, data: list[Recording], sizes: _Sizes, longest: int
+) -> tuple[Shooting, Array]:
     """Return a problem of short pieces and its solution: first for parameters alone, then with starts."""
     n, p = len(sizes.noise), len(parameters.names)
     samples = sum(len(r.states) for r in data)
@@ -182,7 +186,7 @@ def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) 
     for length in sorted({*short, long}):
         pieces = cut(data, length)
         starts = [sizes.guesses[piece.recording][piece.first] for piece in pieces]
-        shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
+        shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap, longest)
         z = np.concatenate([z[:p], *starts])
         shooting.simulate(z)  # a first guess may be refused
         z[:p] = shooting.solve(z, COARSE, starts=False).x

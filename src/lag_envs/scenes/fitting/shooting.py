@@ -26,9 +26,9 @@ Array = NDArray[np.float64]
 #: The largest factor by which one search may change a parameter that is sought by its logarithm: parameters
 #: that short pieces do not determine must not run away.
 FARTHEST = np.log(1e3)
-#: The largest number of evaluations of a search; nearly all searches that succeed take less than a tenth of
-#: it.
-LONGEST = 500
+#: The largest number of evaluations of a search, and of one whose steps need many substeps; nearly all
+#: searches that succeed take less than a tenth of the former.
+LONGEST, LONGEST_SLOW = 500, 50
 
 
 class Piece(NamedTuple):
@@ -73,6 +73,8 @@ class Shooting:
         Expected size of the residuals of each state.
     gap : ndarray, shape (n_state,)
         Expected size of the gaps between pieces.
+    longest : int
+        Largest number of evaluations of a search.
     """
 
     def __init__(
@@ -82,14 +84,15 @@ class Shooting:
         pieces: Sequence[Piece],
         noise: Array,
         gap: Array,
+        longest: int = LONGEST,
     ) -> None:
         self.parameters, self.recordings, self.pieces = parameters, recordings, pieces
-        self.noise, self.gap = noise.copy(), gap.copy()
+        self.noise, self.gap, self.longest = noise.copy(), gap.copy(), longest
         self._known: tuple[bytes, Any] = b"", None
 
     def weighed(self, noise: Array, gap: Array) -> Shooting:
         """Return the problem with other expected sizes."""
-        return Shooting(self.parameters, self.recordings, self.pieces, noise, gap)
+        return Shooting(self.parameters, self.recordings, self.pieces, noise, gap, self.longest)
 
     def simulate(self, z: Array) -> tuple[Scene, list[Array]]:
         """Return the scene, and each piece's motion; raise StepRefused, or ValueError for the parameters."""
@@ -196,5 +199,5 @@ class Shooting:
             x_scale="jac",
             ftol=tolerance,
             xtol=tolerance,
-            max_nfev=LONGEST,
+            max_nfev=self.longest,
         )
