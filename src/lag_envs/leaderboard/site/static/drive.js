@@ -248,10 +248,11 @@ function open(root, board, code, tools) {
   };
   stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "There is nothing to control"}. Space starts and pauses, R restarts, N draws another start.`);
 
-  let { constants } = code;
+  let [machine, constants] = [code, code.constants];
+  let [fuller, fetching] = [null, false];
   const anySeed = () => big(Math.floor(Math.random() * 2 ** 32));
   let seed = anySeed();
-  let me = new Episode(code, seed, constants);
+  let me = new Episode(machine, seed, constants);
   let mine = [];
   let ghost = null;
   let linked = null;
@@ -306,8 +307,8 @@ function open(root, board, code, tools) {
     return `${name}${start === undefined ? "" : `, seed ${start}`}, return ${text(total, 2)}`;
   }
 
-  /** Whether the chosen ghost is still loading; until it is there, nothing starts, because a ghost restarts the drive. */
-  const loading = () => Boolean(ghostSelect.value && !ghost);
+  /** Whether the chosen ghost or machine is still loading; until it is there, nothing starts, because it restarts the drive. */
+  const loading = () => fetching || Boolean(ghostSelect.value && !ghost);
 
   async function chooseGhost() {
     const asked = ghostSelect.value;
@@ -349,7 +350,7 @@ function open(root, board, code, tools) {
 
   function startGhost() {
     if (!ghost?.act) return;
-    ghost.episode = new Episode(code, seed, constants);
+    ghost.episode = new Episode(machine, seed, constants);
     [ghost.past, ghost.now] = [ghost.episode.poses(), ghost.episode.poses()];
   }
 
@@ -395,7 +396,7 @@ function open(root, board, code, tools) {
 
   /** Go back to the start, which is not shown yet. */
   function rewind() {
-    me = new Episode(code, seed, constants);
+    me = new Episode(machine, seed, constants);
     mine = [];
     [past, now] = [me.poses(), me.poses()];
     left = 0;
@@ -424,7 +425,7 @@ function open(root, board, code, tools) {
    * slower, and compiles what it has run often. So a drive begins at full speed.
    */
   function warmUp() {
-    const [trial, act, room] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest), roomOf(about)];
+    const [trial, act, room] = [new Episode(machine, seed, constants), ghost?.act ?? (() => about.rest), roomOf(about)];
     let steps = 0;
     const more = () => {
       if (running || me.steps) return; // an agent may have a memory that reaches back to the start of its episode
@@ -643,8 +644,8 @@ function open(root, board, code, tools) {
 
   function look() {
     if (!board.picture) return null;
-    const others = about.sliders.filter((slider) => slider.looks).map(({ looks, at }) => {
-      const place = clamp(2 * Math.log2(constants[at] / code.constants[at]) + 2, 0, looks.length - 1);
+    const others = inputs.filter(({ slider }) => slider.looks).map(({ slider: { looks }, input: { value, min, max } }) => {
+      const place = ((value - min) / (max - min)) * (looks.length - 1);
       const first = Math.min(Math.floor(place), looks.length - 2);
       return scaled([looks[first].shapes, looks[first].window], [looks[first + 1].shapes, looks[first + 1].window], place - first);
     });
@@ -654,11 +655,11 @@ function open(root, board, code, tools) {
   }
 
   const inputs = about.sliders.map((slider) => {
-    const input = make("input", { type: "range", min: "-1", max: "1", step: "0.01", value: "0" });
+    const input = make("input", { type: "range", min: slider.most ? "0" : "-1", max: "1", step: "0.01", value: "0" });
     const output = make("output");
     const name = slider.name.replace(/^com_/, "centre-of-mass ").replace(/_/g, " ");
     const say = () => {
-      const value = slider.value * 2 ** Number(input.value);
+      const value = slider.most ? slider.most * Number(input.value) : slider.value * 2 ** Number(input.value);
       output.textContent = `${+(value * (slider.shown ?? 1)).toPrecision(3)} ${slider.unit}`.trim();
       input.setAttribute("aria-valuetext", output.textContent);
       return value;
@@ -672,19 +673,46 @@ function open(root, board, code, tools) {
     return { slider, input, say };
   });
 
+  /** Parameters that are 0 in the environment and are not now: its own step lacks their terms. */
+  const added = () => inputs.filter(({ slider, input }) => slider.most && Number(input.value));
+
   /** Apply the sliders' values and all that follows from them, and start over. */
   function change() {
     const values = inputs.map(({ say }) => say());
-    constants = code.constants;
+    if (added().length && !fuller) {
+      fetchFuller();
+      return;
+    }
+    const last = machine;
+    [machine, constants] = [added().length ? fuller : code, code.constants];
     if (inputs.some(({ input }) => Number(input.value) !== 0)) {
       constants = Float64Array.from(code.constants);
       inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
-      code.functions.derive(constants);
+      machine.functions.derive(constants);
     }
     picture = look();
     restart();
+    if (machine !== last) warmUp();
     tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
   }
+
+  /** Load the step with the terms of all parameters, and apply the sliders then. */
+  async function fetchFuller() {
+    if (fetching) return;
+    if (running) pause();
+    fetching = true;
+    label();
+    tell("Loading the changed machine …");
+    const found = await load(tools.fuller).catch(() => null);
+    fetching = false;
+    fuller = found && { ...code, ...found };
+    const wanted = added();
+    if (!fuller) for (const { input } of wanted) input.value = "0";
+    if (wanted.length) change();
+    label();
+    if (!fuller) tell("The changed machine could not be loaded. Move the slider again when you are online.");
+  }
+
   const reset = button("reset", "Reset");
   reset.addEventListener("click", () => {
     for (const { input } of inputs) input.value = "0";

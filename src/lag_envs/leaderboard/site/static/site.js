@@ -1225,7 +1225,7 @@
     const root = find("#drive");
     if (!root) return null;
     const [begin, said] = [find(".begin", root), find(".status", root)];
-    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, hash, calm };
+    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, hash, calm, fuller: root.dataset.fuller };
     let driver = null;
 
     async function open(wanted) {
