@@ -257,7 +257,7 @@ function open(root, board, code, tools) {
   let ghost = null;
   let linked = null;
   let rerunning = null;
-  let running = false;
+  let [running, turn] = [false, 0];
   let tapped = null;
   let [before, left, shownAt] = [0, 0, 0];
   let places = null;
@@ -396,6 +396,7 @@ function open(root, board, code, tools) {
 
   /** Go back to the start, which is not shown yet. */
   function rewind() {
+    if (!running) turn += 1;
     me = new Episode(machine, seed, constants);
     mine = [];
     [past, now] = [me.poses(), me.poses()];
@@ -454,21 +455,31 @@ function open(root, board, code, tools) {
     if (me.over) close();
   }
 
-  /** Stop. Numbers, words and link wait for frames of their own, because each of them lays out the page anew. */
-  function close(words = "") {
-    const of = me;
-    const later = (work) => () => {
-      if (me === of && !running) work();
+  /** Do things in frames of their own, because each of them lays out the page anew; until others are to be done. */
+  function inTurn(...things) {
+    turn += 1;
+    const now = turn;
+    const next = (time) => {
+      if (turn !== now) return;
+      things.shift()(time);
+      if (things.length) requestAnimationFrame(next);
     };
+    requestAnimationFrame(next);
+  }
+
+  /** Stop. */
+  function close(words = "") {
     running = false;
-    requestAnimationFrame(later(() => {
-      label();
-      readOut(entries(ghostAt(1)));
-      requestAnimationFrame(later(() => {
-        finish(words);
-        idly(later(offer));
-      }));
-    }));
+    const told = entries(ghostAt(1));
+    inTurn(
+      () => writeList(readout, told), // not visible yet
+      () => {
+        readOut(told);
+        label();
+      },
+      () => finish(words),
+      () => idly(offer),
+    );
   }
 
   function finish(words) {
@@ -488,8 +499,8 @@ function open(root, board, code, tools) {
 
   /** Offer the link of this drive. */
   function offer() {
-    if (!untouched() || !mine.length || rerunning) return;
-    setLink(writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, "")));
+    const whole = !running && untouched() && mine.length && !rerunning;
+    setLink(whole ? writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, "")) : "");
   }
 
   function frame(time) {
@@ -521,6 +532,7 @@ function open(root, board, code, tools) {
   function label() {
     stage.toggleAttribute("data-driving", running);
     readout.setAttribute("aria-hidden", running); // `spoken` replaces it
+    spoken.setAttribute("aria-hidden", !running);
     for (const starts of [go, again, fresh]) starts.disabled = loading();
     go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
   }
@@ -530,15 +542,14 @@ function open(root, board, code, tools) {
     running = true;
     tapped = null;
     shownAt = 0;
-    show(1); // before anything is written, as the places of the numbers are asked for
     note();
     message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
       : waiting() ? `Time begins with your first ${touched ? "touch" : "key"}.` : "";
     said.textContent = message.textContent || "Driving";
-    setLink("");
-    before = performance.now();
-    label();
-    requestAnimationFrame(frame);
+    inTurn(label, offer, (time) => {
+      before = time;
+      requestAnimationFrame(frame);
+    });
   }
 
   /** Drive from the start. */
@@ -567,11 +578,12 @@ function open(root, board, code, tools) {
 
   function pause() {
     running = false;
+    turn += 1;
     hands.release();
+    show(1); // first, as it asks for the canvas's size
     label();
     tell(`Paused at ${text(me.steps * about.dt, 2)} seconds.`);
     offer();
-    show(1);
   }
 
   // --- display
@@ -613,7 +625,7 @@ function open(root, board, code, tools) {
       [pen.font, pen.fillStyle, pen.textBaseline] = [places.font, places.colour, "middle"];
       told.forEach(([, value], i) => pen.fillText(value, ...places.at[i]));
     }
-    writeList(spoken, running ? told : []); // within the canvas, for those who do not see it
+    writeList(spoken, told); // within the canvas, for those who do not see it
   }
 
   /** Where the numbers of a list stand and how they look: asked seldom, as the browser may have to lay out the page. */
