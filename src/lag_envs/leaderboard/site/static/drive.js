@@ -486,7 +486,7 @@ function open(root, board, code, tools) {
     const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
     const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
     const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
-    const next = touched ? "Start again repeats this start; New start draws another."
+    const next = touched ? "Restart repeats this start; New start draws another."
       : `Press R to ${rerunning ? "drive from this start" : "try again"}, N for another start.`;
     tell(`${ending}: ${result}${beside}. ${next}`);
   }
@@ -534,7 +534,8 @@ function open(root, board, code, tools) {
     readout.setAttribute("aria-hidden", running); // `spoken` replaces it
     spoken.setAttribute("aria-hidden", !running);
     for (const starts of [go, again, fresh]) starts.disabled = loading();
-    go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
+    again.hidden = ended(); // `go` does the same then
+    go.textContent = running ? "Pause" : ended() ? "Restart" : me.steps ? "Resume" : "Start";
   }
 
   function run() {
