@@ -257,7 +257,7 @@ function open(root, board, code, tools) {
   let ghost = null;
   let linked = null;
   let rerunning = null;
-  let [running, turn] = [false, 0];
+  let [running, turn, beat] = [false, 0, 0];
   let tapped = null;
   let [before, left, shownAt] = [0, 0, 0];
   let places = null;
@@ -507,7 +507,7 @@ function open(root, board, code, tools) {
     if (!running) return;
     if (waiting()) {
       before = time;
-      requestAnimationFrame(frame);
+      beat = requestAnimationFrame(frame);
       return;
     }
     if (!me.steps && !rerunning) message.textContent = "";
@@ -526,7 +526,7 @@ function open(root, board, code, tools) {
       return;
     }
     show(left / about.dt);
-    requestAnimationFrame(frame);
+    beat = requestAnimationFrame(frame);
   }
 
   function label() {
@@ -547,9 +547,10 @@ function open(root, board, code, tools) {
     message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
       : waiting() ? `Time begins with your first ${touched ? "touch" : "key"}.` : "";
     said.textContent = message.textContent || "Driving";
+    cancelAnimationFrame(beat); // of a drive that was stopped within this frame
     inTurn(label, offer, (time) => {
       before = time;
-      requestAnimationFrame(frame);
+      beat = requestAnimationFrame(frame);
     });
   }
 
