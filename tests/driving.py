@@ -27,11 +27,14 @@ BARE = (
     cylinder_in_cylinder.Tilt.id,
 )
 #: Plays actions in the page and returns the bits of all results.
-ROLLOUT = """async ([program, code, episodes]) => {
+ROLLOUT = """async ([program, code, episodes, fuller, changes = []]) => {
     const drive = await lagEnvs.load(program);
-    const made = await lagEnvs.load(code);
+    const made = { ...(await lagEnvs.load(code)), ...(fuller && (await lagEnvs.load(fuller))) };
+    const constants = Float64Array.from(made.constants);
+    for (const [at, value] of changes) constants[at] = value;
+    if (changes.length) made.functions.derive(constants);
     return episodes.map(([seed, actions]) => {
-        const episode = new drive.Episode(made, BigInt(seed));
+        const episode = new drive.Episode(made, BigInt(seed), constants);
         const all = () => [...episode.f].map(drive.hexOf).join();
         const told = [all()];
         for (const action of actions) {
@@ -92,12 +95,15 @@ def files(folder, name):
     return [f"assets/{program.name}", f"assets/{code.name}"]
 
 
-def check_bits(page, folder, task, name, episodes, steps=math.inf):
-    """Compare the page's episodes with Python's, for `episodes` of (seed, actions) of at most some steps."""
-    env = Unfused(task)
+def check_bits(page, folder, task, name, episodes, steps=math.inf, env=None, more=()):
+    """Compare the page's episodes with Python's, for `episodes` of (seed, actions) of at most some steps.
+
+    For a changed machine `env` is this machine, and `more` its file and its changed constants.
+    """
+    env = env or Unfused(task)
     for seed, actions in episodes:
         told, used = rollout(task, seed, actions, env, steps)
-        (found,) = page.evaluate(ROLLOUT, [*files(folder, name), [[str(seed), used]]])
+        (found,) = page.evaluate(ROLLOUT, [*files(folder, name), [[str(seed), used]], *more])
         assert found == told, next(
             (i, a, b) for i, (a, b) in enumerate(zip(found, told, strict=False)) if a != b
         )

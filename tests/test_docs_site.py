@@ -295,6 +295,8 @@ def test_documentation_and_board_share_their_head(site, browser):
             page.goto(f"{site.as_uri()}/{name}.html")
             seen.append(page.evaluate(looks))
             places.append([page.locator(selector).first.evaluate(left) for selector in selectors])
+            page.evaluate("scrollTo({ top: 400, behavior: 'instant' })")
+            assert page.evaluate("document.querySelector('header').getBoundingClientRect().bottom") <= 0.0
         assert seen[0] == seen[1]
         assert places[0] == pytest.approx(places[1], abs=1.0)
     for name, button in (("board/index", ".scheme"), ("index", "label[title=Light]")):

@@ -203,7 +203,7 @@ def test_while_watching_the_keys_are_said_to_be_silent(drive, link):
     assert message(page).startswith("Watching the link's drive: you do not steer")
     assert page.evaluate("document.activeElement.className") == "stage"
     until(page, "document.querySelector('.message').textContent.includes('Press R to drive from this start')")
-    assert page.text_content(".go") == "Start again"
+    assert page.text_content(".go") == "Restart" and not page.is_visible(".again")
     page.click(".go")
     until(page, "document.querySelector('.go').textContent === 'Pause'")
     assert message(page) == ""
@@ -429,6 +429,37 @@ def test_a_changed_machine_is_not_scored(drive):
     page.click(".reset")
     assert "scored again" in message(page)
     assert field.get_attribute("placeholder") == "Your drive's link, once it stops"
+
+
+def test_what_is_0_can_be_added(drive):
+    """The step with the terms of such a parameter is loaded once it is moved, and only if it can be."""
+    page = drive(incline.Brake.id)
+    fuller = "document.querySelectorAll('script[src*=fuller]').length"
+    assert page.evaluate(fuller) == 0
+    page.click(".sliders summary")
+    damping = page.locator(".sliders label", has_text="damping")
+    assert damping.locator("output").text_content() == "0 N s/m"
+    page.evaluate(HOLD)
+    damping.locator("input").fill("0.5")
+    assert message(page) == "Loading the changed machine …" and page.is_disabled(".go")
+    page.evaluate("window.held.dispatchEvent(new Event('error'))")
+    until(page, "document.querySelector('.message').textContent.includes('could not be loaded')")
+    assert damping.locator("output").text_content() == "0 N s/m" and page.is_enabled(".go")
+    page.evaluate("delete document.head.append")
+    damping.locator("input").fill("0.5")
+    until(page, "document.querySelector('.message').textContent.includes('not scored')")
+    assert damping.locator("output").text_content() == "0.7 N s/m" and page.evaluate(fuller) == 1
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    until(page, "document.querySelector('.message').textContent.startsWith('The episode has ended')")
+    assert reading(page, "Score") == "not scored" and page.is_disabled(".copy")
+    page.click(".reset")
+    assert "scored again" in message(page)
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    page.wait_for_timeout(200)
+    page.keyboard.press("Space")
+    assert replay.replay(link_of(page)).true
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,9 @@ from driving import (
 )
 from own_tasks import TASKS as OWN
 
+from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.site.build import write_page
+from lag_envs.leaderboard.site.driving import fuller, sliders
 from lag_envs.tasks import TASKS, incline
 from tests import board_pages
 
@@ -36,6 +38,23 @@ def test_the_pages_step_has_pythons_bits_on_users_tasks_too(browsing, bare, kind
     page = browsing.open(f"{bare.as_uri()}/{incline.Tilt.id}.html", bare.as_uri())
     task = kind()
     check_bits(page, bare, task, kind.id, [(seed, at_random(task, seed)) for seed in (3, 2**64 - 1)])
+
+
+@pytest.mark.parametrize("id", [id for id in TASKS if fuller(TASKS[id])[0]])
+def test_so_has_that_of_a_machine_with_more_to_it(browsing, alone, id):
+    """With all sliders moved, also those of parameters that are 0."""
+    page = browsing.open(f"{alone.as_uri()}/{id}.html", alone.as_uri())
+    base, (full, _) = Unfused(TASKS[id]()), fuller(TASKS[id])
+    changed = Unfused(full.task, full.program)
+    changed.constants[:] = base.constants
+    moved = [(one["at"], one.get("most", 1.2 * one["value"])) for one in sliders(TASKS[id], base)]
+    for at, value in moved:
+        changed.constants[at] = value
+    full.program.functions["derive"](changed.constants)
+    (file,) = alone.glob("assets/*-fuller-*.js")
+    episodes = [(7, at_random(full.task, 1)), (2**63 + 11, at_random(full.task, 2))]
+    more = (f"assets/{file.name}", moved)
+    check_bits(page, alone, full.task, id, episodes, steps=100, env=changed, more=more)
 
 
 @pytest.mark.slow

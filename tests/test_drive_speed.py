@@ -76,14 +76,14 @@ def frames(page, ghost=False, to_the_end=False):
     page.wait_for_timeout(2000 if to_the_end else 500)  # the first frames also compile
     page.context.browser.start_tracing(page=page, categories=categories)
     for i in range(8):
-        if page.text_content(".go") == "Start again" and not to_the_end:
+        if page.text_content(".go") == "Restart" and not to_the_end:
             page.keyboard.press("r")  # short episodes have too few frames
         key = ("ArrowLeft", "ArrowRight")[i % 2]
         page.keyboard.down(key)
         page.wait_for_timeout(400)
         page.keyboard.up(key)
     if to_the_end:
-        until(page, "document.querySelector('.go').textContent === 'Start again'")
+        until(page, "document.querySelector('.go').textContent === 'Restart'")
         link_of(page)
     events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
     # Numbers that change are painted on a canvas, not laid out as text; a restart lays out some.
@@ -100,7 +100,7 @@ def frames(page, ghost=False, to_the_end=False):
     for name, took in {"scripts": scripts, "whole frames": whole}.items():
         if not len(took):
             continue
-        median, most, longest = np.quantile(took, [0.5, 0.99, 1.0])
-        print(f"{len(took)} {name} [ms]: median {median:.2f}, 99 % {most:.2f}, longest {longest:.2f}")
+        shown = {f"{100 * part:g} %": f"{np.quantile(took, part):.2f}" for part in (0.5, 0.9, 0.99, 1.0)}
+        print(f"{len(took)} {name} [ms]: {shown}")
     assert len(scripts) > 30 and layouts < 0.1 * len(scripts)
     return scripts, whole

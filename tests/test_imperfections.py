@@ -510,7 +510,7 @@ def test_pages_and_drives_leave_out_what_scripts_lack(monkeypatch):
         imperfections = {"action_delay": 0.5 * pivoted_bar.SwingUp.interval}
 
     monkeypatch.setitem(TASKS.data, Late.id, Late)
-    assert driving.script(Late.id) is None
+    assert driving.scripts(Late.id) == (None, None)
     drive = replay.Drive(Late.id, 1, "", 0.0, "")
     with pytest.raises(replay.LinkError, match=f"{Late.id} .* only .*action_delay in whole steps"):
         replay.replay(drive)

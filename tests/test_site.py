@@ -16,8 +16,9 @@ from lag_envs.leaderboard import standings
 from lag_envs.leaderboard.log import BoardError
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import render, write_page
-from lag_envs.leaderboard.site.driving import sliders
+from lag_envs.leaderboard.site.driving import fuller, sliders
 from lag_envs.leaderboard.site.scenery import Scenery, picture_data
+from lag_envs.scenes import Pendulum, parameter
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS, acrobot, cylinder_in_cylinder, incline, pendulum
 from tests import board_pages
@@ -343,7 +344,7 @@ def test_contrast(theme):
 @pytest.mark.parametrize(
     "kind, names",
     [
-        (incline.Brake, ["mass", "radius", "tilt", "gravity"]),
+        (incline.Brake, ["mass", "radius", "damping", "tilt", "gravity"]),
         (
             cylinder_in_cylinder.Tilt,
             ["mass", "shell_radius", "radius", "damping", "gravity", "control limit"],
@@ -351,12 +352,40 @@ def test_contrast(theme):
         # Without rotor inertia the gear ratio has no effect.
         (
             acrobot.AcrobotExact,
-            ["mass_1", "mass_2", "length_1", "length_2", "inertia_1", "inertia_2", "gravity"],
+            [
+                *("mass_1", "mass_2", "length_1", "length_2", "inertia_1", "inertia_2"),
+                *("damping", "dry_friction", "rotor_inertia", "gravity"),
+            ],
         ),
     ],
 )
 def test_parameters_that_the_script_follows_have_sliders(kind, names):
     assert [slider["name"] for slider in sliders(kind, Unfused(kind()))] == names
+
+
+class SoftPendulum(Pendulum):
+    """With a parameter in a denominator, and one of a unit that is none."""
+
+    softness: float = parameter(0.0, "1", least=0.0)
+    colour: float = parameter(0.0, "hue", least=0.0)
+
+    def potential(self, q, xp):
+        return super().potential(q, xp) / (1.0 + self.softness) - self.colour * xp.cos(q.theta)
+
+
+class Softened(pendulum.PendulumExact):
+    id = "Softened-v0"
+    scene = SoftPendulum
+
+
+def test_parameters_that_are_0_go_up_from_there():
+    """To a tenth of what mass, length and gravity give for their unit; unless a formula divides by them."""
+    found = {slider["name"]: slider for slider in sliders(Softened, Unfused(Softened()))}
+    assert [name for name, slider in found.items() if "most" in slider] == ["damping"]
+    assert found["damping"]["value"] == 0.0
+    assert found["damping"]["most"] == pytest.approx(0.1 * 1.0 * 1.0**2 * math.sqrt(10.0 / 1.0))
+    assert "softness" not in found and "colour" not in found
+    assert fuller(incline.Tilt) == (None, {})
 
 
 @pytest.mark.slow

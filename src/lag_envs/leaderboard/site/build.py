@@ -240,8 +240,9 @@ def _board_with_files(
     scenery = Scenery(str(given["id"]))
     board = _board(_clean(given), protocol, scenery)
     board["page"] = _unused(board["page"], taken)
-    code = None if board["frozen"] else driving.script(str(given["id"]))
+    code, fuller = (None, None) if board["frozen"] else driving.scripts(str(given["id"]))
     board["code"] = code and assets.keep(f"{board['page']}-drive", "js", code)
+    board["fuller"] = fuller and assets.keep(f"{board['page']}-fuller", "js", fuller)
     board["film"] = None
     for i, row in enumerate(board["rows"]):
         own = str(row["id"] or row["name"]).removeprefix(f"{board['id']}-")

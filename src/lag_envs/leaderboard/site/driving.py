@@ -24,18 +24,25 @@ from lag_envs.tasks.base import Task
 
 #: Marks of the sliders, as multiples of a parameter's value.
 MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
+#: Marks for a parameter that is 0, as multiples of its `natural_size`.
+ADDED = (0.0, 0.025, 0.05, 0.075, 0.1)
+#: Units as powers of kilogram, metre and second.
+UNITS = {
+    "kg": (1, 0, 0), "m": (0, 1, 0), "s": (0, 0, 1), "N": (1, 1, -2), "J": (1, 2, -2), "W": (1, 2, -3),
+    "rad": (0, 0, 0), "1": (0, 0, 0),
+}  # fmt: skip
 
 
-def script(env_id: str) -> str | None:
-    """Return the file with which a page drives an environment of the package.
+def scripts(env_id: str) -> tuple[str | None, str | None]:
+    """Return the files of `script_of` and `fuller_script_of` for an environment of the package.
 
     None for an unknown id, and for an environment with imperfections that scripts do not have.
     """
     kind: Any = TASKS.get(env_id)
     try:
-        return script_of(kind) if kind else None
+        return (script_of(kind), fuller_script_of(kind)) if kind else (None, None)
     except FormulaError:
-        return None
+        return None, None
 
 
 @cache
@@ -52,15 +59,21 @@ def script_of(kind: type[Task]) -> str:
     str
         JavaScript: a call of ``lagEnvs.put`` with the step's functions and data about it.
     """
-    task = kind()
-    env = Unfused(task)
-    program, names = env.program, ", ".join(env.program.names)
-    constants = ", ".join(map(_number, program.constants))
-    about = page_json(_about(kind, env))
-    return (
-        f'"use strict";\n(() => {{\n{program.javascript}'
-        f"lagEnvs.put({{ functions: {{ {names} }}, constants: [{constants}], about: {about} }});\n}})();\n"
-    )
+    env = Unfused(kind())
+    constants = ", ".join(map(_number, env.program.constants))
+    return _file(env, f", constants: [{constants}], about: {page_json(_about(kind, env))}")
+
+
+def fuller_script_of(kind: type[Task]) -> str | None:
+    """Return the file with the functions of the step that `fuller` finds, if any."""
+    env, _ = fuller(kind)
+    return _file(env) if env else None
+
+
+def _file(env: Unfused, more: str = "") -> str:
+    names = ", ".join(env.program.names)
+    put = f"lagEnvs.put({{ functions: {{ {names} }}{more} }});"
+    return f'"use strict";\n(() => {{\n{env.program.javascript}{put}\n}})();\n'
 
 
 def _number(x: float) -> str:
@@ -120,28 +133,22 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
 
     Only parameters that have an effect, and for which the changed script steps like an environment made
     with the changed value: Python code beyond the formulas' arithmetic does not reach the script. The effect
-    on the picture is given at `MARKS`. The limit of the controls is a factor, `shown` in units of the only
+    on the picture is given at the marks. A parameter that is 0 has a largest value, `most`; for values above
+    0 there is the script of `fuller`. The limit of the controls is a factor, `shown` in units of the only
     control or in per cent.
     """
-    task, program = env.task, env.program
-    names, fields = list(program.given), type(task.scene).__dataclass_fields__
-    fixed = {*program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
-    values = {name: value for name, value in parameter_values(task.scene).items() if name not in fixed}
-    marked = {
-        name: others
-        for name, value in values.items()
-        if 0.0 < value < math.inf and (others := _made(kind, {name: value}, MARKS))
-    }
-    # Try all at once, which is quick; try them one by one only if that fails.
-    together = _follows(env, {name: values[name] for name in marked})
+    task, names, fields = env.task, list(env.program.given), type(env.task.scene).__dataclass_fields__
+    more, added = fuller(kind)
+    marked = _followed(kind, env) | added
     found: list[dict[str, Any]] = []
-    for name, others in marked.items():
-        if together or _follows(env, {name: values[name]}):
-            looks = [_look(other) for other in others]
+    for name, value in _changeable(env).items():
+        if marks := marked.get(name):
+            looks = [_look(other) for other in _made(kind, {name: marks})]
             seen = looks[0] != looks[-1]
-            if seen or _acts(env, name, MARKS[-1] * values[name]):
+            if seen or _acts((more if name in added else None) or env, name, marks):
                 unit, at = fields[name].metadata["unit"], names.index(f"self_{name}")
-                slider = {"name": name, "unit": "" if unit == "1" else unit, "at": at, "value": values[name]}
+                slider = {"name": name, "unit": "" if unit == "1" else unit, "at": at, "value": value}
+                slider |= {"most": marks[-1]} if name in added else {}
                 found.append(slider | ({"looks": looks} if seen else {}))
     acting = task.formulas.acting
     if not task.formulas.choices and acting and all(a.low == -a.high for a in acting):
@@ -153,27 +160,114 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     return found
 
 
-def _made(kind: type[Task], values: Mapping[str, float], marks: Sequence[float]) -> list[Task]:
-    """Return the task with parameters at marks; empty if one of them is refused."""
+def _changeable(env: Unfused) -> dict[str, float]:
+    """Return the parameters that are given, neither drawn nor computed from others."""
+    task = env.task
+    fixed = {*env.program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
+    values = parameter_values(task.scene)
+    return {name: value for name, value in values.items() if name not in fixed and 0.0 <= value < math.inf}
+
+
+def _followed(kind: type[Task], env: Unfused) -> dict[str, list[float]]:
+    """Return the parameters above 0 that a task's script follows, with their values at `MARKS`."""
+    marked = {name: [value * mark for mark in MARKS] for name, value in _changeable(env).items() if value}
+    marked = {name: marks for name, marks in marked.items() if _made(kind, {name: marks})}
+    # Try all at once, which is quick; try them one by one only if that fails.
+    if _follows(env, marked):
+        return marked
+    return {name: marks for name, marks in marked.items() if _follows(env, {name: marks})}
+
+
+@cache
+def fuller(kind: type[Task]) -> tuple[Unfused | None, dict[str, list[float]]]:
+    """Return a step that keeps the terms of parameters that are 0, and these with their values at `ADDED`.
+
+    A task's own script leaves these terms out. This one is the script of the same task with the parameters
+    above 0; its numbers have the same places. None if there are no such parameters.
+    """
+    env = Unfused(kind())
+    scene, usual = env.task.scene, _followed(kind, env)
+
+    def fits(added: dict[str, list[float]]) -> tuple[Unfused, dict[str, list[float]]] | None:
+        tasks = _made(kind, added)
+        found = Unfused(tasks[-1]) if tasks else None
+        return (found, added) if found and _alike(env, found) and _follows(found, usual | added) else None
+
+    added = {
+        name: [size * mark for mark in ADDED]
+        for name, value in _changeable(env).items()
+        if value == 0.0 and name not in scene.mechanics.zeros and (size := natural_size(scene, name))
+    }
+    found = fits(added) or fits({name: marks for name, marks in added.items() if fits({name: marks})})
+    return found or (None, {})
+
+
+def natural_size(scene: Any, name: str) -> float:
+    """Return the size of a parameter that its unit has in a scene; 0 if none follows.
+
+    The scene's largest mass, its largest length, and the time √(length / gravity), or a second without
+    gravity, take the place of kilogram, metre and second.
+
+    Examples
+    --------
+    >>> from lag_envs.scenes import Pendulum
+    >>> natural_size(Pendulum(mass=2.0, length=3.0, gravity=12.0), "damping")  # 2 kg (3 m)² / 0.5 s
+    36.0
+    """
+    fields, largest = type(scene).__dataclass_fields__, {"kg": 0.0, "m": 0.0, "m/s²": 0.0}
+    for other, value in parameter_values(scene).items():
+        unit = fields[other].metadata["unit"]
+        if unit in largest and math.isfinite(value):
+            largest[unit] = max(largest[unit], value)
+    mass, length, gravity = largest.values()
+    powers = _powers(fields[name].metadata["unit"])
+    time = math.sqrt(length / gravity) if gravity else 1.0
+    if powers is None or any(n and not x for x, n in zip((mass, length, time), powers, strict=True)):
+        return 0.0
+    return mass ** powers[0] * length ** powers[1] * time ** powers[2]
+
+
+def _powers(unit: str) -> list[int] | None:
+    """Return a unit as powers of kilogram, metre and second; None for an unknown one."""
+    total, (above, *below) = [0, 0, 0], unit.split("/")
+    for text, sign in ((above, 1), *((text, -1) for text in below)):
+        for word in text.split():
+            power = {"²": 2, "³": 3}.get(word[-1], 1)
+            if (known := UNITS.get(word.rstrip("²³"))) is None:
+                return None
+            total = [n + sign * power * m for n, m in zip(total, known, strict=True)]
+    return total
+
+
+def _made(kind: type[Task], marked: Mapping[str, Sequence[float]]) -> list[Task]:
+    """Return the task with parameters at their marks; empty if one of them is refused."""
     try:
-        return [kind(**{name: value * mark for name, value in values.items()}) for mark in marks]
+        rows = zip(*marked.values(), strict=True)
+        return [kind(**dict(zip(marked, row, strict=True))) for row in rows]
     except (ValueError, TypeError, FormulaError):
         return []
 
 
-def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
+def _follows(env: Unfused, marked: Mapping[str, Sequence[float]]) -> bool:
     """Return whether a script with changed parameters does the same as tasks made with them."""
-    others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
-    return bool(others) and all(_steps_as(env, list(values), other) for other in others)
+    others = _made(type(env.task), {name: (marks[0], marks[-1]) for name, marks in marked.items()})
+    return bool(others) and all(_steps_as(env, list(marked), other) for other in others)
 
 
-def _acts(env: Unfused, name: str, value: float) -> bool:
+def _acts(env: Unfused, name: str, marks: Sequence[float]) -> bool:
     """Return whether the step reads a parameter, or a constant that changes with it."""
-    changed = Unfused(env.task, env.program)
-    changed.set_parameter(name, value)
+    lowest, highest = Unfused(env.task, env.program), Unfused(env.task, env.program)
+    lowest.set_parameter(name, marks[0])
+    highest.set_parameter(name, marks[-1])
     step = env.program.python.partition("def start(")[2]  # what comes before computes the constants
-    pairs = zip(env.program.constants, changed.constants, strict=True)
+    pairs = zip(lowest.constants, highest.constants, strict=True)
     return any(a != b and f"k[{i}]" in step for i, (a, b) in enumerate(pairs))
+
+
+def _alike(one: Unfused, other: Unfused) -> bool:
+    """Return whether the numbers of two steps have the same places."""
+    a, b = ((list(p.given), list(p.derived), p.rows, p.frames) for p in (one.program, other.program))
+    return a == b
 
 
 def _look(task: Task) -> dict[str, Any]:

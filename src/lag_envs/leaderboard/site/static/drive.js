@@ -248,15 +248,16 @@ function open(root, board, code, tools) {
   };
   stage.setAttribute("aria-label", `Drive ${board.id}. ${heard || "There is nothing to control"}. Space starts and pauses, R restarts, N draws another start.`);
 
-  let { constants } = code;
+  let [machine, constants] = [code, code.constants];
+  let [fuller, fetching] = [null, false];
   const anySeed = () => big(Math.floor(Math.random() * 2 ** 32));
   let seed = anySeed();
-  let me = new Episode(code, seed, constants);
+  let me = new Episode(machine, seed, constants);
   let mine = [];
   let ghost = null;
   let linked = null;
   let rerunning = null;
-  let running = false;
+  let [running, turn, beat] = [false, 0, 0];
   let tapped = null;
   let [before, left, shownAt] = [0, 0, 0];
   let places = null;
@@ -306,8 +307,8 @@ function open(root, board, code, tools) {
     return `${name}${start === undefined ? "" : `, seed ${start}`}, return ${text(total, 2)}`;
   }
 
-  /** Whether the chosen ghost is still loading; until it is there, nothing starts, because a ghost restarts the drive. */
-  const loading = () => Boolean(ghostSelect.value && !ghost);
+  /** Whether the chosen ghost or machine is still loading; until it is there, nothing starts, because it restarts the drive. */
+  const loading = () => fetching || Boolean(ghostSelect.value && !ghost);
 
   async function chooseGhost() {
     const asked = ghostSelect.value;
@@ -349,7 +350,7 @@ function open(root, board, code, tools) {
 
   function startGhost() {
     if (!ghost?.act) return;
-    ghost.episode = new Episode(code, seed, constants);
+    ghost.episode = new Episode(machine, seed, constants);
     [ghost.past, ghost.now] = [ghost.episode.poses(), ghost.episode.poses()];
   }
 
@@ -395,7 +396,8 @@ function open(root, board, code, tools) {
 
   /** Go back to the start, which is not shown yet. */
   function rewind() {
-    me = new Episode(code, seed, constants);
+    if (!running) turn += 1;
+    me = new Episode(machine, seed, constants);
     mine = [];
     [past, now] = [me.poses(), me.poses()];
     left = 0;
@@ -424,7 +426,7 @@ function open(root, board, code, tools) {
    * slower, and compiles what it has run often. So a drive begins at full speed.
    */
   function warmUp() {
-    const [trial, act, room] = [new Episode(code, seed, constants), ghost?.act ?? (() => about.rest), roomOf(about)];
+    const [trial, act, room] = [new Episode(machine, seed, constants), ghost?.act ?? (() => about.rest), roomOf(about)];
     let steps = 0;
     const more = () => {
       if (running || me.steps) return; // an agent may have a memory that reaches back to the start of its episode
@@ -453,28 +455,38 @@ function open(root, board, code, tools) {
     if (me.over) close();
   }
 
-  /** Stop. Numbers, words and link wait for frames of their own, because each of them lays out the page anew. */
-  function close(words = "") {
-    const of = me;
-    const later = (work) => () => {
-      if (me === of && !running) work();
+  /** Do things in frames of their own, because each of them lays out the page anew; until others are to be done. */
+  function inTurn(...things) {
+    turn += 1;
+    const now = turn;
+    const next = (time) => {
+      if (turn !== now) return;
+      things.shift()(time);
+      if (things.length) requestAnimationFrame(next);
     };
+    requestAnimationFrame(next);
+  }
+
+  /** Stop. */
+  function close(words = "") {
     running = false;
-    requestAnimationFrame(later(() => {
-      label();
-      readOut(entries(ghostAt(1)));
-      requestAnimationFrame(later(() => {
-        finish(words);
-        idly(later(offer));
-      }));
-    }));
+    const told = entries(ghostAt(1));
+    inTurn(
+      () => writeList(readout, told), // not visible yet
+      () => {
+        readOut(told);
+        label();
+      },
+      () => finish(words),
+      () => idly(offer),
+    );
   }
 
   function finish(words) {
     const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
     const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
     const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
-    const next = touched ? "Start again repeats this start; New start draws another."
+    const next = touched ? "Restart repeats this start; New start draws another."
       : `Press R to ${rerunning ? "drive from this start" : "try again"}, N for another start.`;
     tell(`${ending}: ${result}${beside}. ${next}`);
   }
@@ -487,15 +499,15 @@ function open(root, board, code, tools) {
 
   /** Offer the link of this drive. */
   function offer() {
-    if (!untouched() || !mine.length || rerunning) return;
-    setLink(writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, "")));
+    const whole = !running && untouched() && mine.length && !rerunning;
+    setLink(whole ? writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, "")) : "");
   }
 
   function frame(time) {
     if (!running) return;
     if (waiting()) {
       before = time;
-      requestAnimationFrame(frame);
+      beat = requestAnimationFrame(frame);
       return;
     }
     if (!me.steps && !rerunning) message.textContent = "";
@@ -514,14 +526,16 @@ function open(root, board, code, tools) {
       return;
     }
     show(left / about.dt);
-    requestAnimationFrame(frame);
+    beat = requestAnimationFrame(frame);
   }
 
   function label() {
     stage.toggleAttribute("data-driving", running);
     readout.setAttribute("aria-hidden", running); // `spoken` replaces it
+    spoken.setAttribute("aria-hidden", !running);
     for (const starts of [go, again, fresh]) starts.disabled = loading();
-    go.textContent = running ? "Pause" : ended() ? "Start again" : me.steps ? "Resume" : "Start";
+    again.hidden = ended(); // `go` does the same then
+    go.textContent = running ? "Pause" : ended() ? "Restart" : me.steps ? "Resume" : "Start";
   }
 
   function run() {
@@ -529,15 +543,15 @@ function open(root, board, code, tools) {
     running = true;
     tapped = null;
     shownAt = 0;
-    show(1); // before anything is written, as the places of the numbers are asked for
     note();
     message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
       : waiting() ? `Time begins with your first ${touched ? "touch" : "key"}.` : "";
     said.textContent = message.textContent || "Driving";
-    setLink("");
-    before = performance.now();
-    label();
-    requestAnimationFrame(frame);
+    cancelAnimationFrame(beat); // of a drive that was stopped within this frame
+    inTurn(label, offer, (time) => {
+      before = time;
+      beat = requestAnimationFrame(frame);
+    });
   }
 
   /** Drive from the start. */
@@ -566,11 +580,12 @@ function open(root, board, code, tools) {
 
   function pause() {
     running = false;
+    turn += 1;
     hands.release();
+    show(1); // first, as it asks for the canvas's size
     label();
     tell(`Paused at ${text(me.steps * about.dt, 2)} seconds.`);
     offer();
-    show(1);
   }
 
   // --- display
@@ -612,7 +627,7 @@ function open(root, board, code, tools) {
       [pen.font, pen.fillStyle, pen.textBaseline] = [places.font, places.colour, "middle"];
       told.forEach(([, value], i) => pen.fillText(value, ...places.at[i]));
     }
-    writeList(spoken, running ? told : []); // within the canvas, for those who do not see it
+    writeList(spoken, told); // within the canvas, for those who do not see it
   }
 
   /** Where the numbers of a list stand and how they look: asked seldom, as the browser may have to lay out the page. */
@@ -643,8 +658,8 @@ function open(root, board, code, tools) {
 
   function look() {
     if (!board.picture) return null;
-    const others = about.sliders.filter((slider) => slider.looks).map(({ looks, at }) => {
-      const place = clamp(2 * Math.log2(constants[at] / code.constants[at]) + 2, 0, looks.length - 1);
+    const others = inputs.filter(({ slider }) => slider.looks).map(({ slider: { looks }, input: { value, min, max } }) => {
+      const place = ((value - min) / (max - min)) * (looks.length - 1);
       const first = Math.min(Math.floor(place), looks.length - 2);
       return scaled([looks[first].shapes, looks[first].window], [looks[first + 1].shapes, looks[first + 1].window], place - first);
     });
@@ -654,11 +669,11 @@ function open(root, board, code, tools) {
   }
 
   const inputs = about.sliders.map((slider) => {
-    const input = make("input", { type: "range", min: "-1", max: "1", step: "0.01", value: "0" });
+    const input = make("input", { type: "range", min: slider.most ? "0" : "-1", max: "1", step: "0.01", value: "0" });
     const output = make("output");
     const name = slider.name.replace(/^com_/, "centre-of-mass ").replace(/_/g, " ");
     const say = () => {
-      const value = slider.value * 2 ** Number(input.value);
+      const value = slider.most ? slider.most * Number(input.value) : slider.value * 2 ** Number(input.value);
       output.textContent = `${+(value * (slider.shown ?? 1)).toPrecision(3)} ${slider.unit}`.trim();
       input.setAttribute("aria-valuetext", output.textContent);
       return value;
@@ -672,19 +687,46 @@ function open(root, board, code, tools) {
     return { slider, input, say };
   });
 
+  /** Parameters that are 0 in the environment and are not now: its own step lacks their terms. */
+  const added = () => inputs.filter(({ slider, input }) => slider.most && Number(input.value));
+
   /** Apply the sliders' values and all that follows from them, and start over. */
   function change() {
     const values = inputs.map(({ say }) => say());
-    constants = code.constants;
+    if (added().length && !fuller) {
+      fetchFuller();
+      return;
+    }
+    const last = machine;
+    [machine, constants] = [added().length ? fuller : code, code.constants];
     if (inputs.some(({ input }) => Number(input.value) !== 0)) {
       constants = Float64Array.from(code.constants);
       inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
-      code.functions.derive(constants);
+      machine.functions.derive(constants);
     }
     picture = look();
     restart();
+    if (machine !== last) warmUp();
     tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
   }
+
+  /** Load the step with the terms of all parameters, and apply the sliders then. */
+  async function fetchFuller() {
+    if (fetching) return;
+    if (running) pause();
+    fetching = true;
+    label();
+    tell("Loading the changed machine …");
+    const found = await load(tools.fuller).catch(() => null);
+    fetching = false;
+    fuller = found && { ...code, ...found };
+    const wanted = added();
+    if (!fuller) for (const { input } of wanted) input.value = "0";
+    if (wanted.length) change();
+    label();
+    if (!fuller) tell("The changed machine could not be loaded. Move the slider again when you are online.");
+  }
+
   const reset = button("reset", "Reset");
   reset.addEventListener("click", () => {
     for (const { input } of inputs) input.value = "0";

@@ -1225,7 +1225,7 @@
     const root = find("#drive");
     if (!root) return null;
     const [begin, said] = [find(".begin", root), find(".status", root)];
-    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, hash, calm };
+    const tools = { make, all, text, symbol, writeList, cleared, paint, placed, apart, windowOf, posesAt, load, episodes, hash, calm, fuller: root.dataset.fuller };
     let driver = null;
 
     async function open(wanted) {
@@ -1282,7 +1282,12 @@
 
   /** Close the list of environments on Escape, and when the reader turns to something else. */
   function startMenu() {
-    const menu = find(".menu");
+    const [menu, pages] = [find(".menu"), find(".pages")];
+    // On narrow screens the menu comes first: for the eye by site.css, for the keyboard by its place.
+    const narrow = matchMedia("(max-width: 76.2344em)");
+    const move = () => pages.parentNode[narrow.matches ? "prepend" : "append"](pages);
+    narrow.addEventListener("change", move);
+    move();
     const away = ({ target }) => {
       if (!menu.contains(target)) menu.open = false;
     };
