@@ -71,8 +71,6 @@ class Certificate:
         if part is not None:
             self._h = t.mul(self._whole, part)
             self._later = {slot: t.mul(part, x) for slot, x in self._norms.items()}
-        # First, because everything else can be computed while these sums wait for their last terms.
-        own = None if part is None else self._largest_of(self._sums(part))
         self._all = {slot: t.add(x, self._size(slot, t.index(0))) for slot, x in self._later.items()}
         self._largest = self._largest_of([self._all[self._series.slot_of["v", i]] for i in range(n)])
         self._sizes = [t.mul(self._largest, per) for per in self._per_root]
@@ -107,8 +105,9 @@ class Certificate:
         self._bounds = [t.mul(self._per_next, g) for g in guess]
         for bound, allowed in zip(self._bounds, self._allowed, strict=True):
             passed = t.both(passed, t.less(bound, allowed))
-        if own is not None:
-            own = t.mul(t.mul(t.number(PART_TOLERANCES), self._tolerance), own)
+        if part is not None:
+            allowed = t.mul(t.number(PART_TOLERANCES), self._tolerance)
+            own = t.mul(allowed, self._largest_of(self._sums(part)))
             for bound, per in zip(self._bounds, self._per_root, strict=True):
                 passed = t.both(passed, t.less(bound, t.mul(own, per)))
         return passed, self._bounds

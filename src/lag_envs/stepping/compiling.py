@@ -16,10 +16,9 @@ from typing import Any
 
 from lag_envs.stepping.tracing import Trace, Value
 
-#: Number of lanes of a batch whose numbers lie together, as rows: few enough for the nearest caches, and
-#: enough for the lanes that need further substeps to fill vectors. A power of two would put the rows of a
-#: lane into the same few places of the cache.
-BLOCK = 288
+#: Number of lanes of a batch whose numbers lie together, as rows: few enough for the nearest cache, and
+#: enough for the lanes that need further substeps to fill vectors.
+BLOCK = 192
 
 _BLOCK = "block_[0-9a-f]{16}"
 _blocks: dict[str, tuple] = {}

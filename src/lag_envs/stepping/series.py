@@ -416,17 +416,6 @@ class Series(SeriesSlots):
 
         t.loop(t.index(1), t.plus(order, 1), [t.number(1.0)], scale)
 
-    def _to_the_order(self, t: Target, x: Any, order: Any) -> Any:
-        """Return x^N by fourth powers: N products, each of which waits for the one before, take longer."""
-        square, quarter = t.mul(x, x), t.half(t.half(order))
-        fourth = t.mul(square, square)
-        (power,) = t.loop(t.index(0), quarter, [t.number(1.0)], lambda k, value: [t.mul(fourth, value[0])])
-        rest = order
-        for _ in range(4):
-            rest = t.minus(rest, quarter)
-        (power,) = t.loop(t.index(0), rest, [power], lambda k, value: [t.mul(x, value[0])])
-        return power
-
     def attempt(
         self,
         t: Target,
@@ -474,7 +463,7 @@ class Series(SeriesSlots):
             passed, part, power, factor, *_ = carried
             factor = t.select(passed, one, factor)
             part = t.mul(factor, part)
-            power = t.mul(power, self._to_the_order(t, factor, order))
+            (power,) = t.loop(t.index(0), order, [power], lambda k, value: [t.mul(factor, value[0])])
             passed, bounds = certificate.check(part, power)
             return going(passed), [passed, part, power, certificate.factor(), *bounds]
 
