@@ -77,6 +77,8 @@ def _advance_block(memory, base, count, order):  # type: ignore[no-untyped-def]
 def _unfinished(memory, base, count, order):  # type: ignore[no-untyped-def]
     """Continue with the lanes that are not done, side by side; return how many were refused."""
     block, rows = memory[base:], memory[base + bounds * BLOCK :]
+    attempts, remains = rows[status * BLOCK :], rows[left * BLOCK :]
+    wishes, lengths = rows[wish * BLOCK :], rows[span * BLOCK :]
     lanes = rows[bounds * BLOCK :]  # the last row: which lanes of the block these are
     going = refused = 0
     # Which lanes go on cannot be foreseen, so a branch for each would often be mispredicted. Numba tests
@@ -89,29 +91,24 @@ def _unfinished(memory, base, count, order):  # type: ignore[no-untyped-def]
         for r in range(bounds):
             rows[r * BLOCK + i] = block[np.uint64(r * BLOCK + lane)]
     for i in range(going, BLOCK):
-        rows[left * BLOCK + i] = 0.0
+        remains[np.uint64(i)] = 0.0
     while going > 0:
         for first in range(0, going, LANES):
             attempt(rows, first, order, tolerance)
-        kept = 0
-        for i in range(min(going, BLOCK)):
-            lane = np.int64(lanes[i])
-            for r in range(q, left):  # of lanes that go on too
-                block[np.uint64(r * BLOCK + lane)] = rows[r * BLOCK + i]
-            if not rows[left * BLOCK + i] > 0.0:
+        # The last of the lanes that go on takes the place of one that does not.
+        for i in range(going - 1, -1, -1):
+            over = not remains[i] > 0.0
+            if not over and attempts[i] < LARGEST_COUNT and wishes[i] > SMALLEST_PART * lengths[i]:
                 continue
-            if rows[status * BLOCK + i] >= LARGEST_COUNT or not (
-                rows[wish * BLOCK + i] > SMALLEST_PART * rows[span * BLOCK + i]
-            ):
-                block[np.uint64(status * BLOCK + lane)] = -rows[status * BLOCK + i]
+            lane, going = np.int64(lanes[i]), going - 1
+            for r in range(q, left):
+                block[np.uint64(r * BLOCK + lane)] = rows[np.uint64(r * BLOCK + i)]
+            if not over:
+                block[np.uint64(status * BLOCK + lane)] *= -1.0
                 refused += 1
-                continue
             for r in range(bounds + 1):
-                rows[np.uint64(r * BLOCK + kept)] = rows[r * BLOCK + i]
-            kept += 1
-        for i in range(kept, going):
-            rows[np.uint64(left * BLOCK + i)] = 0.0
-        going = kept
+                rows[np.uint64(r * BLOCK + i)] = rows[np.uint64(r * BLOCK + going)]
+            remains[np.uint64(going)] = 0.0
     return refused
 
 
