@@ -174,6 +174,7 @@ def test_ghosts_run_beside(drive, haunted):
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
     until(page, "document.activeElement.className === 'stage'")
+    assert page.evaluate("document.querySelectorAll('.drive-controls select')[1].value") == ""
 
 
 def test_a_ghost_that_comes_late_or_never(drive, haunted):

@@ -810,7 +810,7 @@ function open(root, board, code, tools) {
       verdict.dataset.true = "false";
     }
     stage.focus();
-    seed = valid ? big(number) : anySeed();
+    moveTo(valid ? big(number) : anySeed());
     beginAnew();
   }
 
@@ -839,9 +839,14 @@ function open(root, board, code, tools) {
     begin();
   }
 
-  function another() {
+  /** Choose another start; a ghost that belongs to one start leaves. */
+  function moveTo(start) {
     if (ghost?.replays || ghost?.seed !== undefined) dismissGhost();
-    seed = anySeed();
+    seed = start;
+  }
+
+  function another() {
+    moveTo(anySeed());
     afresh();
   }
 
