@@ -131,7 +131,8 @@ def test_lists_of_pages(site):
     feed = ElementTree.parse(site / "board" / "feed.xml")
     (itself,) = feed.iterfind("{*}link[@rel='self']")
     assert itself.get("href").endswith("/lag-envs/board/feed.xml")
-    assert "To the home page</a>" in (site / "404.html").read_text("utf-8")
+    missing = (site / "404.html").read_text("utf-8")
+    assert "To the home page</a>" in missing and "<title>Page not found - lag_envs</title>" in missing
 
 
 def links_in(text, name, start, end):
@@ -268,6 +269,8 @@ def test_in_a_browser(site, browser):
     page.goto(f"{site.as_uri()}/index.html")
     page.get_by_role("textbox", name="Search").fill("truncation bound")
     page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
+    page.keyboard.press("Tab")  # leaves the search, past what can no longer be seen
+    assert page.evaluate("document.activeElement.innerText") == "Home"
     assert not asked
 
 

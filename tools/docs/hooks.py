@@ -261,6 +261,7 @@ def on_post_template(output_content: str, template_name: str, config: MkDocsConf
             f'<p>This page does not exist, or has moved. <a href="{config.site_url}">To the home page</a></p>'
         )
         output_content = output_content.replace("</h1>", f"</h1>\n{told}", 1)
+        output_content = output_content.replace("<title>", "<title>Page not found - ", 1)
     return with_search_name(output_content)
 
 
