@@ -156,7 +156,8 @@ def test_what_the_system_refuses_is_told_in_a_line(tmp_path):
 
 
 def test_an_encoding_that_lacks_a_character_gets_a_question_mark():
-    child = run_stub("print('m s⁻²')", stdout=subprocess.PIPE, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+    poor = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    child = run_stub("print('m s⁻²')", stdout=subprocess.PIPE, env=poor)
     assert child.communicate(timeout=60) == ("m s??\n", "") and child.returncode == 0
 
 
