@@ -364,6 +364,7 @@ def test_figures_suit_narrow_screens_and_the_dark(site, browser):
     assert page.locator(".moving img").evaluate(look)[1] == "screen"
     page.emulate_media(media="print")
     assert page.locator(".moving img").evaluate(look) == ["none", "normal"]
+    assert not page.is_visible(".moving button")
     page.close()
 
 
