@@ -609,7 +609,8 @@ function open(root, board, code, tools) {
       const beside = ghostAt(part);
       if (beside) {
         pen.globalAlpha = 0.35;
-        paint(pen, box, seenFrom, placed(apart(picture, beside.poses, poses), beside.poses, seenFrom));
+        const its = ghost.act ? picture : board.picture; // a recording is of the unchanged machine
+        paint(pen, box, seenFrom, placed(apart(its, beside.poses, poses), beside.poses, seenFrom));
         pen.globalAlpha = 1;
       }
     }
@@ -707,7 +708,8 @@ function open(root, board, code, tools) {
     picture = look();
     restart();
     if (machine !== last) warmUp();
-    tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
+    const usual = ghost?.replays ? " The recorded ghost drives the unchanged one." : "";
+    tell(untouched() ? "The machine is as it was: drives are scored again." : `The machine was changed: this drive is not scored.${usual}`);
   }
 
   /** Load the step with the terms of all parameters, and apply the sliders then. */
