@@ -402,6 +402,19 @@ def _guarded(function, x):
             "no attribute 'brake'; it has trolley_mass, load_mass",
         ),
         ({"reward": lambda self, *_: self.scne.load_mass}, "no attribute 'scne'; did you mean scene"),
+        (
+            {"reward": lambda self, b, after, *_: after.x - self.target.x_goal},
+            "no attribute 'x_goal'; look up only names that exist; state, controls and target are arguments",
+        ),
+        ({"reward": lambda self, b, after, *a: a[-1].abs(after)}, "take the numbers one by one, by name"),
+        (
+            {"reward": lambda self, b, after, *a: a[-1].sin(after.x, after.rope)},
+            r"give functions of xp the arguments of NumPy's, as in xp.cos\(x\)",
+        ),
+        (
+            {"reward": lambda self, *_: self.scene.simulate([0.0] * 6, [[0.0, 0.0]], 0.1)[1, 0]},
+            "reward: a formula calls something that is derived .* self.scene.kinetic",
+        ),
         ({"kick": lambda self, after, draws, xp: {"x": draws[2]}}, "no random draw number 2, only 2 of them"),
         ({"reward": lambda self, b, after, *_: [after.x]}, "returns a list; it must return a number"),
         ({"reward": lambda self, b, after, *_: 1.0 if after.x > 0 else 0.0}, "branch"),
