@@ -808,6 +808,13 @@ def test_what_cannot_be_registered_is_named():
         lag_envs.register(own_tasks.Deliver())
 
 
+@pytest.mark.parametrize("make", [LagrangianEnv, partial(LagrangianVectorEnv, num_envs=2)])
+@pytest.mark.parametrize("place", ["own_tasks:Crane", "own_tasks:TASKS", "math:sin", own_tasks.Crane])
+def test_a_place_that_leads_to_no_task(make, place):
+    with pytest.raises(ValueError, match=r"task must be or lead to a class derived from Task, got [<(]"):
+        make(place)
+
+
 def test_a_task_is_no_dataclass():
     """The decorator would replace how tasks are made."""
     decorated = dataclasses.dataclass(type("Decorated", (own_tasks.Deliver,), {}))
