@@ -57,6 +57,9 @@ def parameter(
             'the unit of a parameter must be text, as in parameter(1.0, "kg"), or "1" for a pure number, got '
             f"{unit!r:.60}"
         )
+    for name, limit in {"above": above, "least": least, "below": below, "most": most}.items():
+        if not (limit is None or isinstance(limit, int | float | np.number)):
+            raise FormulaError(f"{name} of a parameter must be a number, as in {name}=0.0, got {limit!r:.60}")
     lows, highs = {"above": above, "at least": least}, {"below": below, "at most": most}
     for (low, bottom), (high, top) in itertools.product(lows.items(), highs.items()):
         strict = low == "above" or high == "below"
