@@ -442,7 +442,8 @@ def parser() -> argparse.ArgumentParser:
     )
     for name in OPTIONS:
         field = Settings.model_fields[name]
-        kind: Any = {float: float, float | None: float, bool: yes_or_no}.get(field.annotation, int)
+        kinds: dict[Any, Any] = {float: float, float | None: float, bool: yes_or_no}
+        kind = kinds.get(field.annotation, int)
         many: Any = {"nargs": "+"} if get_origin(field.annotation) is list else {}
         shown = "yes|no" if kind is yes_or_no else "X"
         group.add_argument(
