@@ -155,6 +155,12 @@ def test_what_the_system_refuses_is_told_in_a_line(tmp_path):
 # --- list, info ---
 
 
+def test_an_encoding_that_lacks_a_character_gets_a_question_mark():
+    poor = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    child = run_stub("print('m s⁻²')", stdout=subprocess.PIPE, env=poor)
+    assert child.communicate(timeout=60) == ("m s??\n", "") and child.returncode == 0
+
+
 def test_list_says_what_is_to_be_done(capsys):
     assert cli.main(["list"]) == 0
     out = capsys.readouterr().out

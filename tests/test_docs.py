@@ -120,6 +120,12 @@ def test_headings(env_id, page):
     assert list(found) == list(environments.HEADINGS)
 
 
+@each_id
+def test_multiples_of_a_rounding_have_three_digits(env_id, page):
+    for told in re.findall(r"which is (\S+) times one rounding", page):
+        assert len(told.replace(".", "").lstrip("0")) <= 3
+
+
 @pytest.mark.parametrize("env_id", covering(PERFECT))
 def test_action_table(env_id, page):
     """The controls at both ends of the action are those that a step applies."""

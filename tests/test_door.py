@@ -191,6 +191,22 @@ UNTRACEABLE = {
     "complex result": ({"potential": lambda self, q, xp: 1.0 + 2.0j}, "potential; complex"),
     "no result": ({"potential": lambda self, q, xp: None}, "potential; None; return"),
     "array": ({"potential": lambda self, q, xp: np.array([q.x, q.y]) ** 2}, "potential; ndarray; one number"),
+    "all coordinates": (
+        {"potential": lambda self, q, xp: q},
+        "potential; <coordinates x, y, s, rise>; by its name",
+    ),
+    "function of all coordinates": (
+        {"potential": lambda self, q, xp: xp.cos(q)},
+        "potential; <coordinates x, y, s, rise>, which is not a real number",
+    ),
+    "function of two numbers": (
+        {"potential": lambda self, q, xp: xp.sin(q.x, q.y)},
+        "potential; the arguments of NumPy's, as in xp.cos(x)",
+    ),
+    "tangent of nothing": (
+        {"potential": lambda self, q, xp: xp.tan() * q.x},
+        "potential; the arguments of NumPy's, as in xp.cos(x)",
+    ),
     "several results": ({"kinetic": lambda self, q, v, xp: (v.x**2, v.y**2)}, "kinetic; tuple; one number"),
     "text": ({"potential": lambda self, q, xp: q.x + "text"}, "potential; 'text'"),
     "not a number": ({"potential": lambda self, q, xp: q.x * math.nan}, "potential; nan"),
@@ -214,6 +230,10 @@ UNTRACEABLE = {
     ),
     "derived from itself": (
         {"potential": lambda self, q, xp: self.energy([0.0] * 6)["total"]},
+        "potential; derived",
+    ),
+    "simulated by itself": (
+        {"potential": lambda self, q, xp: self.simulate([0.0] * 6, [[0.0, 0.0]], 0.1)[1, 0]},
         "potential; derived",
     ),
     "chance": ({"potential": lambda self, q, xp: random.random() * q.x**2}, "formula; again; chance"),
@@ -320,6 +340,10 @@ INVALID = {
         {"applied": lambda self, q, v, u, xp: {"theta": u.force}},
         "applied; 'theta'; x, y",
     ),
+    "force that is all controls": (
+        {"applied": lambda self, q, v, u, xp: {"x": u}},
+        "applied; for 'x' it returns <controls force, s_ddot>; by its name",
+    ),
     "force that is none": (
         {"applied": lambda self, q, v, u, xp: {"x": u.force if self.links > 3 else None}},
         "applied; None; 'x'",
@@ -349,6 +373,14 @@ INVALID = {
     "shape of texts": (
         {"bodies": lambda self: {"ground": [Circle((0.0, 0.0), "1.0")]}},
         "bodies: sizes must be numbers; '1.0'",
+    ),
+    "shape of negative size": (
+        {"bodies": lambda self: {"ground": [Circle((0.0, 0.0), -1.0)]}},
+        "bodies: sizes must not be negative; radius=-1.0",
+    ),
+    "indicator at a coordinate of the moment": (
+        {"indicators": lambda self, now, xp: {"arrow": (now.x, 0.0)}},
+        "indicators; it has q, state, share, target",
     ),
     "indicator without a place": (
         {"indicators": lambda self, now, xp: {"arrow": now.q.x}},
@@ -716,6 +748,7 @@ def test_unit_of_a_parameter():
         ({"above": 3.0, "below": 2.0}, "the range of a parameter is empty: no value is above 3 and below 2"),
         ({"least": 3.0, "below": 3.0}, "no value is at least 3 and below 3"),
         ({"least": 3.0, "most": 2.0}, "no value is at least 3 and at most 2"),
+        ({"above": "0", "below": 3.0}, "above of a parameter must be a number, as in above=0.0, got '0'"),
         ({"usable": (2.0, 1.0)}, r"usable must be (lowest, highest), in this order, got (2.0, 1.0)"),
     ],
 )

@@ -243,6 +243,8 @@ def test_another_link_or_seed_may_follow_a_link(drive, link):
     page.evaluate(f"location.hash = {replay.write_link(link) + ' '!r}")
     until(page, "document.querySelector('.go').textContent === 'Start'")
     assert "Space or a click starts" in message(page) and reading(page, "Time") == "0.00 s"
+    page.evaluate("location.hash = '#seed=8'")
+    until(page, f"{ghost}.value === ''")
     page.click(".rerun")
     page.evaluate("location.hash = '#seed=9'")
     until(page, "document.querySelector('.message').textContent.includes('starts')")

@@ -171,9 +171,15 @@ def test_ghosts_run_beside(drive, haunted):
     page.focus(".stage")
     page.keyboard.press("Space")
     until(page, f"location.hash === '#seed={2**61 + 3}'")
+    page.keyboard.press("Space")
+    page.click(".sliders summary")
+    page.focus(".sliders input >> nth=0")
+    page.keyboard.press("ArrowRight")
+    assert message(page).endswith("The recorded ghost drives the unchanged one.")
     page.click(".drives a")
     until(page, "location.hash === '#seed=4'")
     until(page, "document.activeElement.className === 'stage'")
+    assert page.evaluate("document.querySelectorAll('.drive-controls select')[1].value") == ""
 
 
 def test_a_ghost_that_comes_late_or_never(drive, haunted):

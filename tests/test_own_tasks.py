@@ -18,6 +18,7 @@ import pytest
 from batches import assert_alike, assert_same, pair
 from contract_scenes import Along, Bead
 from covering import slow
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
 
@@ -88,6 +89,43 @@ def test_numbers_of_a_batch_may_differ_zero_among_them():
 def test_structure_of_a_batch_must_agree():
     with pytest.raises(ValueError, match="agree"):
         gym.make_vec("OwnSwitched-v0", num_envs=2, bars=[3, 4])
+
+
+class Stacked(Along):
+    """A pile of masses on a rail; how many there are is structural, and the tuple may hold anything."""
+
+    id = "OwnStacked-v0"
+    action = {"push": 1.0}
+
+    class scene(Bead):
+        masses: tuple = (1.0, 2.0)
+        controls = {"push": "N"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * sum(self.masses) * v.x**2
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.push}
+
+
+@pytest.mark.parametrize("given", [(1.0, 4.0), [1.0, 4.0], (1.0, 4.0, 3.0), ()])
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_field_that_is_a_tuple(n, given):
+    if not given:
+        with pytest.raises(FormulaError, match="does not contain the rate of 'x'"):
+            gym.make_vec(lag_envs.register(Stacked), num_envs=n, masses=given)
+        return
+    env = gym.make(lag_envs.register(Stacked), masses=given)
+    vec = gym.make_vec(Stacked.id, num_envs=n, masses=given)
+    each = gym.make_vec(Stacked.id, num_envs=n, masses=[given] * n)
+    copies = (
+        gym.make(EnvSpec.from_json(env.spec.to_json())),
+        gym.make_vec(EnvSpec.from_json(vec.spec.to_json())),
+    )
+    for other in (env, vec, each, *copies):
+        assert other.unwrapped.scene.masses == tuple(given)
+    with pytest.raises(ValueError, match="must agree in structural options"):
+        gym.make_vec(Stacked.id, num_envs=2, masses=[given, (1.0, 7.0)])
 
 
 def test_targets():
@@ -402,6 +440,19 @@ def _guarded(function, x):
             "no attribute 'brake'; it has trolley_mass, load_mass",
         ),
         ({"reward": lambda self, *_: self.scne.load_mass}, "no attribute 'scne'; did you mean scene"),
+        (
+            {"reward": lambda self, b, after, *_: after.x - self.target.x_goal},
+            "no attribute 'x_goal'; look up only names that exist; state, controls and target are arguments",
+        ),
+        ({"reward": lambda self, b, after, *a: a[-1].abs(after)}, "take the numbers one by one, by name"),
+        (
+            {"reward": lambda self, b, after, *a: a[-1].sin(after.x, after.rope)},
+            r"give functions of xp the arguments of NumPy's, as in xp.cos\(x\)",
+        ),
+        (
+            {"reward": lambda self, *_: self.scene.simulate([0.0] * 6, [[0.0, 0.0]], 0.1)[1, 0]},
+            "reward: a formula calls something that is derived .* self.scene.kinetic",
+        ),
         ({"kick": lambda self, after, draws, xp: {"x": draws[2]}}, "no random draw number 2, only 2 of them"),
         ({"reward": lambda self, b, after, *_: [after.x]}, "returns a list; it must return a number"),
         ({"reward": lambda self, b, after, *_: 1.0 if after.x > 0 else 0.0}, "branch"),
@@ -755,6 +806,13 @@ def test_what_cannot_be_registered_is_named():
         lag_envs.register(type("Blank", (own_tasks.Deliver,), {"id": ""}))
     with pytest.raises(ValueError, match="register takes a task's class, or 'module:Class', got <"):
         lag_envs.register(own_tasks.Deliver())
+
+
+@pytest.mark.parametrize("make", [LagrangianEnv, partial(LagrangianVectorEnv, num_envs=2)])
+@pytest.mark.parametrize("place", ["own_tasks:Crane", "own_tasks:TASKS", "math:sin", own_tasks.Crane])
+def test_a_place_that_leads_to_no_task(make, place):
+    with pytest.raises(ValueError, match=r"task must be or lead to a class derived from Task, got [<(]"):
+        make(place)
 
 
 def test_a_task_is_no_dataclass():

@@ -319,6 +319,12 @@ def test_nothing_in_the_page_is_from_elsewhere():
         assert set(found) <= {"http://www.w3.org/2000/svg"}, path
 
 
+def test_a_finger_that_drives_selects_no_text_in_safari_either():
+    """Safari knows the property only by its own name."""
+    text = (site.STATIC / "site.css").read_text("utf-8")
+    assert text.count("-webkit-user-select: none; user-select: none;") == text.count(" user-select:") > 0
+
+
 def luminance(colour):
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in parts]

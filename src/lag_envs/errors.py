@@ -2,6 +2,7 @@
 
 import difflib
 import inspect
+import io
 import os
 import re
 import signal
@@ -23,8 +24,10 @@ def run_shown(program: str, run: Callable[[], int]) -> int:
     """Run a command, show its errors in a line, and treat SIGTERM like Ctrl-C; return its exit status.
 
     The status is 2 for a `UserError`, 1 if the system refuses something, as when a disk is full, and 130 if
-    the command is interrupted.
+    the command is interrupted. Characters that the output's encoding lacks are written as question marks.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
     with terminable():
         try:
             status = run()
@@ -125,6 +128,8 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
     --------
     >>> hint("PivotedBra-v0", ["PivotedBar-v0", "Acrobot-v1"])
     'did you mean PivotedBar-v0?'
+    >>> hint("bat", ["bar", "ball", "cat"])
+    'did you mean cat, bar or ball?'
     >>> hint("Nope-v0", ["PivotedBar-v0", "Acrobot-v1"], "see the list")
     'see the list'
     """
@@ -133,7 +138,8 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
     names = {_without_version(k): k for k in known}
     close = [names[c] for c in difflib.get_close_matches(_without_version(name), names, n=3, cutoff=0.5)]
     if close:
-        return f"did you mean {' or '.join(close)}?"
+        *others, last = close
+        return f"did you mean {', '.join(others) + ' or ' if others else ''}{last}?"
     return otherwise or f"available: {', '.join(known)}"
 
 

@@ -142,9 +142,11 @@ def in_words(env_id: str, total: float, whole: bool = True) -> str:
     --------
     >>> in_words("PivotedBar-v0", 209.6)
     'return 209.6, score 0.501 (0 is random, 1 the best known)'
+    >>> in_words("PivotedBar-v0", -0.8)
+    'return -0.8, score 0.000 (0 is random, 1 the best known)'
     >>> in_words("PivotedBar-v0", 209.6, whole=False)
     'return 209.6'
     """
     value = score(env_id, total) if whole else None
-    about = "" if value is None else f", score {value:.3f} (0 is random, 1 the best known)"
+    about = "" if value is None else f", score {value:z.3f} (0 is random, 1 the best known)"
     return f"return {total:.4g}{about}"

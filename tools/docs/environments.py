@@ -27,7 +27,7 @@ from lag_envs.scenes.declaring import complete
 from lag_envs.scenes.derivation import form_of, layout_of
 from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
-from lag_envs.tables import markdown_table, mean_with_error, number_text
+from lag_envs.tables import markdown_table, mean_with_error, number_text, three_digits
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured_entry
@@ -340,7 +340,7 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
                 "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
                 f"error of a single step is {row['one step']:.1e} of the state's size. The largest error of "
                 f"an episode is {row['whole episode']:.1e}, which is "
-                f"{number_text(row['error / rounding floor'])} times one rounding of the start, as "
+                f"{three_digits(row['error / rounding floor'])} times one rounding of the start, as "
                 "amplified by the system. See [Accuracy](../accuracy.md)."
             )
     return "\n\n".join(texts)

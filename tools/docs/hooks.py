@@ -137,6 +137,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     # Numbers such as 1e-16 are not broken at their hyphens.
     html = re.sub(r"<td>(?=[^<]{1,10}</td>)", '<td class="short">', html)
     html = html.replace("::</p>", ":</p>")  # docstrings announce code by two colons
+    html = _changed(html, lambda text: re.sub(r"(?<=\[\d\])_|^\.\. (?=\[\d\])", "", text))  # and write [1]_
     return with_minus(with_formulas(with_lazy_pictures(html)))
 
 
@@ -261,6 +262,7 @@ def on_post_template(output_content: str, template_name: str, config: MkDocsConf
             f'<p>This page does not exist, or has moved. <a href="{config.site_url}">To the home page</a></p>'
         )
         output_content = output_content.replace("</h1>", f"</h1>\n{told}", 1)
+        output_content = output_content.replace("<title>", "<title>Page not found - ", 1)
     return with_search_name(output_content)
 
 

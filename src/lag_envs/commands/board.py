@@ -60,7 +60,7 @@ REPLAY = Command(
     "recompute a drive from its link",
     """Recompute a drive, given as a link from the leaderboard's page, from its seed and keys, with
 arithmetic that has the same bits on every machine, and check whether the link claims the right
-return. The exit status is 0 if it does, 1 if it does not, 2 for a damaged link.
+return. The exit status is 0 if it does, 1 if it does not, 2 for a damaged or forged link.
 
 examples:
   lag-envs replay 'https://example.org/board/PivotedBar-v0.html#drive=1~...'

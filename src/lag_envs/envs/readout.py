@@ -157,10 +157,17 @@ def _write_name(surface: pygame.Surface, name: str, x: int, y: int, colour: str)
 
 
 def _number(value: float) -> str:
+    """Return a number in a few digits.
+
+    Examples
+    --------
+    >>> _number(-0.0001), _number(-1.5), _number(math.nan)
+    ('0.000', '−1.500', '–')
+    """
     if math.isnan(value):
         return "–"
     digits = 3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1
-    return (f"{value:.{digits}f}" if abs(value) < 1e4 else f"{value:.2e}").replace("-", "−")
+    return (f"{value:z.{digits}f}" if abs(value) < 1e4 else f"{value:.2e}").replace("-", "−")
 
 
 def _draw_scale(surface: pygame.Surface, scale: float, longest: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -709,6 +710,17 @@ def _is_one_target(kind: type[Task], values: Any) -> bool:
     return several and not any(isinstance(v, (Mapping, list, tuple, np.ndarray)) for v in values)
 
 
+def _is_one_tuple(kind: type[Task], name: str, values: Any) -> bool:
+    """Return whether a sequence is the value of a field that is a tuple, and not one such value for each."""
+    field = inspect.signature(kind.scene).parameters.get(name) if isinstance(kind.scene, type) else None
+    return field is not None and isinstance(field.default, tuple) and _depth(values) <= _depth(field.default)
+
+
+def _depth(value: Any) -> int:
+    """Return how many sequences lie within each other."""
+    return 1 + max(map(_depth, value), default=0) if isinstance(value, list | tuple) else 0
+
+
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     """Return a task for each environment; all are the same object if no option varies."""
     many = {
@@ -717,6 +729,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
         if (isinstance(values, list | tuple) or (isinstance(values, np.ndarray) and values.ndim > 0))
         and name not in KEYWORDS
         and not (name == "target" and _is_one_target(kind, values))
+        and not _is_one_tuple(kind, name, values)
     }
     for name, values in many.items():
         if is_masked(values):

@@ -152,7 +152,7 @@ class Expr:
             return value
         if isinstance(value, Atom):
             return Expr({((value, 1),): 1})
-        if getattr(value, "shape", None) == ():  # one of NumPy's numbers, or an array without dimensions
+        if hasattr(type(value), "shape") and value.shape == ():  # NumPy's number, or array without dimensions
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise FormulaError(

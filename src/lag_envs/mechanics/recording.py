@@ -228,16 +228,20 @@ def _remedy(of: Any, error: Exception, used: Sequence[str] | None) -> str:
         return f"write xp.{of_numpy[1]}, and functions of xp only"
     if isinstance(error, RecursionError):
         return "a formula calls itself without end"
-    if isinstance(error, KeyError):
+    owner = getattr(error, "obj", None)
+    if isinstance(error, KeyError) or isinstance(owner, Mapping):
         return "look up only names that exist; state, controls and target are arguments"
     if of_xp := re.search(r"Trace\.(\w+)\(\) missing", str(error)):
         return f"give xp.{of_xp[1]} all its arguments, as for NumPy's"
-    owner = getattr(error, "obj", None)
+    if re.search(r"(function_of|Functions\.tan|Trace\.\w+)\(\) (missing|takes)", str(error)):
+        return "give functions of xp the arguments of NumPy's, as in xp.cos(x)"
+    if names := getattr(type(owner), "_fields", None):
+        return f"it has {', '.join(names)}"
     ours = owner is not None and type(owner) in (type(of), type(getattr(of, "scene", None)))
     if not isinstance(error, AttributeError) or not ours:
         if used is not None:
             return f"it was given {', '.join(f'{f}={getattr(of, f)!r:.40}' for f in used) or 'no fields'}"
-        if "'Values'" in str(error):  # arithmetic with all of them
+        if re.search("'(Values|State)'", str(error)):  # arithmetic with all of them
             return "take the numbers one by one, by name or index"
         return "use + - * /, whole powers and functions of xp"
     fields = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
@@ -274,6 +278,8 @@ def single_expression(value: Any, what: str = "") -> Expr:
     """Return a formula's result as an expression, or raise a FormulaError."""
     if value is None:
         raise FormulaError(f"{what}returns None; end it with a return of a number")
+    if isinstance(value, Values):
+        raise FormulaError(f"{what}returns {value!r:.60}; take one of them, by its name")
     if getattr(value, "ndim", 0) or isinstance(value, tuple | list | set | dict):
         raise FormulaError(f"{what}returns {type(value).__name__} where one number is expected")
     if isinstance(value, complex):

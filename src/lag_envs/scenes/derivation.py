@@ -79,8 +79,9 @@ def motion_constants_of(scene: Scene, lagged: bool = False) -> dict[str, float]:
     kept = "_cached_lagged_constants" if lagged else "_cached_constants"
     found = vars(scene).get(kept)
     if found is None:
+        code = _form_or_series(scene, lagged)  # outside, since a FormulaError is a ValueError too
         try:
-            found = _form_or_series(scene, lagged).constants(parameter_values(scene))
+            found = code.constants(parameter_values(scene))
         except (ArithmeticError, ValueError) as error:  # a division by 0, the root of a negative number, ...
             raise ValueError(undefined(scene)) from error
         if not all(map(math.isfinite, found.values())):

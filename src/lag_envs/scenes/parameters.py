@@ -1,4 +1,4 @@
-"""How a scene declares its parameters, and the check of their ranges."""
+"""How a scene declares its parameters, the check of their ranges, and what their units say."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.mechanics.recording import formula
+from lag_envs.mechanics.recording import formula, parameter_values
 from lag_envs.scenes.checks import SMALLEST, check_number, shown
+
+#: Units as powers of kilogram, metre and second.
+UNITS = {
+    "kg": (1, 0, 0), "m": (0, 1, 0), "s": (0, 0, 1), "N": (1, 1, -2), "J": (1, 2, -2), "W": (1, 2, -3),
+    "rad": (0, 0, 0), "1": (0, 0, 0),
+}  # fmt: skip
 
 
 def parameter(
@@ -51,6 +57,9 @@ def parameter(
             'the unit of a parameter must be text, as in parameter(1.0, "kg"), or "1" for a pure number, got '
             f"{unit!r:.60}"
         )
+    for name, limit in {"above": above, "least": least, "below": below, "most": most}.items():
+        if not (limit is None or isinstance(limit, int | float | np.number)):
+            raise FormulaError(f"{name} of a parameter must be a number, as in {name}=0.0, got {limit!r:.60}")
     lows, highs = {"above": above, "at least": least}, {"below": below, "at most": most}
     for (low, bottom), (high, top) in itertools.product(lows.items(), highs.items()):
         strict = low == "above" or high == "below"
@@ -152,3 +161,40 @@ def _rules(field: dataclasses.Field, number: float) -> list[tuple[str, Any, bool
         ("below", below, below is not None and not number < below),
         ("at most", most, most is not None and not number <= most),
     ]
+
+
+def natural_size(scene: Any, name: str) -> float:
+    """Return the size that a parameter's unit suggests in a scene; 0 if it suggests none.
+
+    The scene's largest mass, its largest length, and the time √(length / gravity), or a second without
+    gravity, take the place of kilogram, metre and second.
+
+    Examples
+    --------
+    >>> from lag_envs.scenes import Pendulum
+    >>> natural_size(Pendulum(mass=2.0, length=3.0, gravity=12.0), "damping")  # 2 kg (3 m)² / 0.5 s
+    36.0
+    """
+    fields, largest = type(scene).__dataclass_fields__, {"kg": 0.0, "m": 0.0, "m/s²": 0.0}
+    for other, value in parameter_values(scene).items():
+        unit = fields[other].metadata["unit"]
+        if unit in largest and math.isfinite(value):
+            largest[unit] = max(largest[unit], value)
+    mass, length, gravity = largest.values()
+    powers = _powers(fields[name].metadata["unit"])
+    time = math.sqrt(length / gravity) if gravity else 1.0
+    if powers is None or any(n and not x for x, n in zip((mass, length, time), powers, strict=True)):
+        return 0.0
+    return mass ** powers[0] * length ** powers[1] * time ** powers[2]
+
+
+def _powers(unit: str) -> list[int] | None:
+    """Return a unit as powers of kilogram, metre and second; None for an unknown one."""
+    total, (above, *below) = [0, 0, 0], unit.split("/")
+    for text, sign in ((above, 1), *((text, -1) for text in below)):
+        for word in text.split():
+            power = {"²": 2, "³": 3}.get(word[-1], 1)
+            if (known := UNITS.get(word.rstrip("²³"))) is None:
+                return None
+            total = [n + sign * power * m for n, m in zip(total, known, strict=True)]
+    return total

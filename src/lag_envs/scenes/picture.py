@@ -203,7 +203,9 @@ def _fault(shape: Any) -> str:
         return "sizes must be numbers, and points pairs (x, y)"
     if points.shape[1:] != (2,) or len(points) < (3 if isinstance(shape, Polygon) else 1) or sizes.ndim > 1:
         return "points must be pairs (x, y), three or more for a polygon"
-    return "" if np.isfinite(points).all() and np.isfinite(sizes).all() else "numbers must be finite"
+    if not (np.isfinite(points).all() and np.isfinite(sizes).all()):
+        return "numbers must be finite"
+    return "" if (sizes >= 0.0).all() else "sizes must not be negative"
 
 
 def indicated(of: Any, now: Now, xp: Any = Seen) -> dict[str, tuple]:

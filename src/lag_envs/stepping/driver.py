@@ -63,11 +63,11 @@ def _advance_block(memory, base, count, order):  # type: ignore[no-untyped-def]
     negative to begin with is left alone. Afterwards it is the number of attempts, negative where a lane was
     refused.
     """
+    block = memory[base:]
     for i in range(BLOCK):
-        stepped = i < count and memory[base + status * BLOCK + i] >= 0.0
-        memory[base + status * BLOCK + i] = 0.0 if stepped else -1.0
-        length = memory[base + span * BLOCK + i] if stepped else 0.0
-        memory[base + left * BLOCK + i] = memory[base + wish * BLOCK + i] = length
+        stepped = (i < count) & (block[status * BLOCK + i] >= 0.0)
+        block[status * BLOCK + i] = 0.0 if stepped else -1.0
+        block[left * BLOCK + i] = block[wish * BLOCK + i] = block[span * BLOCK + i] if stepped else 0.0
     over = 1
     for first in range(0, count, LANES):
         over &= attempt(memory, base + first, order, tolerance)
@@ -76,37 +76,39 @@ def _advance_block(memory, base, count, order):  # type: ignore[no-untyped-def]
 
 def _unfinished(memory, base, count, order):  # type: ignore[no-untyped-def]
     """Continue with the lanes that are not done, side by side; return how many were refused."""
-    rows = memory[base + bounds * BLOCK :]  # the last row has the lanes' numbers
+    block, rows = memory[base:], memory[base + bounds * BLOCK :]
+    attempts, remains = rows[status * BLOCK :], rows[left * BLOCK :]
+    wishes, lengths = rows[wish * BLOCK :], rows[span * BLOCK :]
+    lanes = rows[bounds * BLOCK :]  # the last row: which lanes of the block these are
     going = refused = 0
-    for i in range(count):
-        if memory[base + left * BLOCK + i] > 0.0:
-            for r in range(bounds):
-                rows[r * BLOCK + going] = memory[base + r * BLOCK + i]
-            rows[bounds * BLOCK + going] = i
-            going += 1
+    # Which lanes go on cannot be foreseen, so a branch for each would often be mispredicted. Numba tests
+    # whether an index counts from the end, unless it is unsigned or can be seen not to be negative.
+    for i in range(min(count, BLOCK)):
+        lanes[np.uint64(going)] = i
+        going += block[left * BLOCK + i] > 0.0
+    for i in range(min(going, BLOCK)):
+        lane = np.int64(lanes[i])
+        for r in range(bounds):
+            rows[r * BLOCK + i] = block[np.uint64(r * BLOCK + lane)]
     for i in range(going, BLOCK):
-        rows[left * BLOCK + i] = 0.0
+        remains[np.uint64(i)] = 0.0
     while going > 0:
         for first in range(0, going, LANES):
             attempt(rows, first, order, tolerance)
-        kept = 0
-        for i in range(going):
-            lane = base + np.int64(rows[bounds * BLOCK + i])
-            if not rows[left * BLOCK + i] > 0.0:
-                for r in range(q, left):
-                    memory[lane + r * BLOCK] = rows[r * BLOCK + i]
-            elif rows[status * BLOCK + i] >= LARGEST_COUNT or not (
-                rows[wish * BLOCK + i] > SMALLEST_PART * rows[span * BLOCK + i]
-            ):
-                memory[lane + status * BLOCK] = -rows[status * BLOCK + i]
+        # The last of the lanes that go on takes the place of one that does not.
+        for i in range(going - 1, -1, -1):
+            over = not remains[i] > 0.0
+            if not over and attempts[i] < LARGEST_COUNT and wishes[i] > SMALLEST_PART * lengths[i]:
+                continue
+            lane, going = np.int64(lanes[i]), going - 1
+            for r in range(q, left):
+                block[np.uint64(r * BLOCK + lane)] = rows[np.uint64(r * BLOCK + i)]
+            if not over:
+                block[np.uint64(status * BLOCK + lane)] *= -1.0
                 refused += 1
-            else:
-                for r in range(bounds + 1):
-                    rows[r * BLOCK + kept] = rows[r * BLOCK + i]
-                kept += 1
-        for i in range(kept, going):
-            rows[left * BLOCK + i] = 0.0
-        going = kept
+            for r in range(bounds + 1):
+                rows[np.uint64(r * BLOCK + i)] = rows[np.uint64(r * BLOCK + going)]
+            remains[np.uint64(going)] = 0.0
     return refused
 
 

@@ -35,17 +35,25 @@ def __getattr__(name: str) -> Any:
 
 
 def load_task(place: str | type[Any]) -> type[Any]:
-    """Return the task class at "module:Class"; a class is returned unchanged.
+    """Return the task class at "module:Class"; a task class is returned unchanged.
 
     Raises
     ------
     UserError
         If the module exists but fails when it is imported; the error names the file.
     ValueError
-        For any other place that does not lead to a class.
+        For anything else that is not a task class, and does not lead to one.
     """
-    if isinstance(place, type):
-        return place
+    from lag_envs.tasks.base import Task
+
+    kind = place if isinstance(place, type) else _found(place)
+    if not (isinstance(kind, type) and issubclass(kind, Task)):
+        raise ValueError(f"task must be or lead to a class derived from Task, got {kind!r:.100}")
+    return kind
+
+
+def _found(place: Any) -> Any:
+    """Return the object at "module:Class", or raise an error as `load_task` does."""
     if not isinstance(place, str):
         raise ValueError(
             f"task must be given as 'module:Class' or as the class itself, its parameters as keywords, "

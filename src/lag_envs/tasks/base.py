@@ -209,7 +209,8 @@ class Task(metaclass=TaskType):
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
             raise FormulaError(f"{of}.scene must be a class derived from Scene, got {kind!r:.60}")
         asked = {name: parameters.pop(name) for name in KEYWORDS if name in parameters}
-        known = list(inspect.signature(kind).parameters)
+        fields = inspect.signature(kind).parameters
+        known = list(fields)
         for name in known:
             if name in _reserved():
                 raise FormulaError(
@@ -237,8 +238,11 @@ class Task(metaclass=TaskType):
                 f"got an unexpected keyword argument {name!r}; {meant}{' ' if meant else ''}this environment "
                 f"takes {', '.join(options)}"
             )
-        #: Parameters of the scene that were given, here or by the class.
-        self.given = dict(self.defaults) | parameters
+        #: Parameters of the scene that were given, here or by the class. JSON has lists for tuples.
+        self.given = dict(self.defaults) | {
+            name: _tuples(value) if isinstance(fields[name].default, tuple) else value
+            for name, value in parameters.items()
+        }
         self.scene = kind(**self.given)
         if self.order is not None:
             vars(self.scene)[ORDER] = check_order(f"{of}.order", self.order)
@@ -601,6 +605,11 @@ def check_task(what: str, task: Any) -> None:
     """Raise a TypeError for a value that is not a task, such as an id or an environment."""
     if not isinstance(task, Task):
         raise TypeError(f"{what} takes a task, such as gym.make(ID).unwrapped.task, got {shown(task)}")
+
+
+def _tuples(value: Any) -> Any:
+    """Return a list, and lists within it, as tuples; other values as they are."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 @cache

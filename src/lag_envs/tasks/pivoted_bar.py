@@ -69,12 +69,12 @@ class SwingUp(GuardedTrack, _Bar):
 
     ## Starting State
 
-    The bar hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused. At
-    the start, s lies within a tenth of the track's half length.
+    The bar hangs, nearly at rest. With a track, starts from which the support cannot stop inside it are
+    refused, and s begins within a tenth of the track's half length.
 
     ## Episode End
 
-    Termination: never. The ends of the track are guarded, as described above.
+    Termination: never. The ends of a track are guarded, as described above.
 
     ## Arguments
 

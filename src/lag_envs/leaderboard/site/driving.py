@@ -18,6 +18,7 @@ from lag_envs.mechanics.recording import parameter_values
 from lag_envs.replay import LEVELS, VERSION
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.derivation import form_of
+from lag_envs.scenes.parameters import natural_size
 from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -26,11 +27,6 @@ from lag_envs.tasks.base import Task
 MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 #: Marks for a parameter that is 0, as multiples of its `natural_size`.
 ADDED = (0.0, 0.025, 0.05, 0.075, 0.1)
-#: Units as powers of kilogram, metre and second.
-UNITS = {
-    "kg": (1, 0, 0), "m": (0, 1, 0), "s": (0, 0, 1), "N": (1, 1, -2), "J": (1, 2, -2), "W": (1, 2, -3),
-    "rad": (0, 0, 0), "1": (0, 0, 0),
-}  # fmt: skip
 
 
 def scripts(env_id: str) -> tuple[str | None, str | None]:
@@ -200,43 +196,6 @@ def fuller(kind: type[Task]) -> tuple[Unfused | None, dict[str, list[float]]]:
     }
     found = fits(added) or fits({name: marks for name, marks in added.items() if fits({name: marks})})
     return found or (None, {})
-
-
-def natural_size(scene: Any, name: str) -> float:
-    """Return the size of a parameter that its unit has in a scene; 0 if none follows.
-
-    The scene's largest mass, its largest length, and the time √(length / gravity), or a second without
-    gravity, take the place of kilogram, metre and second.
-
-    Examples
-    --------
-    >>> from lag_envs.scenes import Pendulum
-    >>> natural_size(Pendulum(mass=2.0, length=3.0, gravity=12.0), "damping")  # 2 kg (3 m)² / 0.5 s
-    36.0
-    """
-    fields, largest = type(scene).__dataclass_fields__, {"kg": 0.0, "m": 0.0, "m/s²": 0.0}
-    for other, value in parameter_values(scene).items():
-        unit = fields[other].metadata["unit"]
-        if unit in largest and math.isfinite(value):
-            largest[unit] = max(largest[unit], value)
-    mass, length, gravity = largest.values()
-    powers = _powers(fields[name].metadata["unit"])
-    time = math.sqrt(length / gravity) if gravity else 1.0
-    if powers is None or any(n and not x for x, n in zip((mass, length, time), powers, strict=True)):
-        return 0.0
-    return mass ** powers[0] * length ** powers[1] * time ** powers[2]
-
-
-def _powers(unit: str) -> list[int] | None:
-    """Return a unit as powers of kilogram, metre and second; None for an unknown one."""
-    total, (above, *below) = [0, 0, 0], unit.split("/")
-    for text, sign in ((above, 1), *((text, -1) for text in below)):
-        for word in text.split():
-            power = {"²": 2, "³": 3}.get(word[-1], 1)
-            if (known := UNITS.get(word.rstrip("²³"))) is None:
-                return None
-            total = [n + sign * power * m for n, m in zip(total, known, strict=True)]
-    return total
 
 
 def _made(kind: type[Task], marked: Mapping[str, Sequence[float]]) -> list[Task]:

@@ -609,7 +609,8 @@ function open(root, board, code, tools) {
       const beside = ghostAt(part);
       if (beside) {
         pen.globalAlpha = 0.35;
-        paint(pen, box, seenFrom, placed(apart(picture, beside.poses, poses), beside.poses, seenFrom));
+        const its = ghost.act ? picture : board.picture; // a recording is of the unchanged machine
+        paint(pen, box, seenFrom, placed(apart(its, beside.poses, poses), beside.poses, seenFrom));
         pen.globalAlpha = 1;
       }
     }
@@ -707,7 +708,8 @@ function open(root, board, code, tools) {
     picture = look();
     restart();
     if (machine !== last) warmUp();
-    tell(untouched() ? "The machine is as it was: drives are scored again." : "The machine was changed: this drive is not scored.");
+    const usual = ghost?.replays ? " The recorded ghost drives the unchanged one." : "";
+    tell(untouched() ? "The machine is as it was: drives are scored again." : `The machine was changed: this drive is not scored.${usual}`);
   }
 
   /** Load the step with the terms of all parameters, and apply the sliders then. */
@@ -810,7 +812,7 @@ function open(root, board, code, tools) {
       verdict.dataset.true = "false";
     }
     stage.focus();
-    seed = valid ? big(number) : anySeed();
+    moveTo(valid ? big(number) : anySeed());
     beginAnew();
   }
 
@@ -839,9 +841,14 @@ function open(root, board, code, tools) {
     begin();
   }
 
-  function another() {
+  /** Choose another start; a ghost that belongs to one start leaves. */
+  function moveTo(start) {
     if (ghost?.replays || ghost?.seed !== undefined) dismissGhost();
-    seed = anySeed();
+    seed = start;
+  }
+
+  function another() {
+    moveTo(anySeed());
     afresh();
   }
 
