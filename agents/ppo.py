@@ -69,6 +69,9 @@ class Settings(LearnerSettings):
     clip_range: float = Field(gt=0, description="limit of a probability's relative change in an update")
     ent_coef: float = Field(ge=0, description="weight of the entropy in the loss")
     vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
+    limit_coef: float = Field(
+        0.0, ge=0, description="weight of the squares by which mean actions exceed their limits in the loss"
+    )
     max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
     reward_scale: float = Field(gt=0, description="factor of the rewards")
     episode_share: float = Field(gt=0, le=1, description="share of its length after which an episode is cut")
@@ -376,13 +379,19 @@ class Learner:
                 seen, gain = observations[batch], advantage[batch]
                 gain = (gain - gain.mean()) / (gain.std() + 1e-8)
                 features = body(seen)
-                log_prob, entropy = self.head.log_prob(features, last(features), actions[batch])
+                means = last(features)
+                log_prob, entropy = self.head.log_prob(features, means, actions[batch])
                 ratio = (log_prob - before[batch]).exp()
                 limited = ratio.clamp(1.0 - s.clip_range, 1.0 + s.clip_range)
                 better = torch.min(ratio * gain, limited * gain).mean()
                 off = (self.critic(seen)[:, 0] - target[batch]).square().mean()
+                loss = s.vf_coef * off - better - s.ent_coef * entropy.mean()
+                if s.limit_coef and not self.policy.choices:
+                    # Far beyond a limit noise changes nothing, so nothing would be learned there.
+                    beyond = (means.abs() / self.policy.largest - 1.0).clamp(min=0.0)
+                    loss = loss + s.limit_coef * beyond.square().mean()
                 self.gradient.zero_()
-                (s.vf_coef * off - better - s.ent_coef * entropy.mean()).backward()
+                loss.backward()
                 self.gradient.mul_((s.max_grad_norm / (self.gradient.norm() + 1e-6)).clamp(max=1.0))
                 self.adam.step()
 
