@@ -63,9 +63,15 @@ class Settings(LearnerSettings):
     learning_rate: float = Field(ge=0, description="Adam's step size at the start; falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     gae_lambda: float = Field(ge=0, le=1, description="decay of the advantage's weights")
+    td_lambda: float | None = Field(
+        None, ge=0, le=1, description="decay of the weights in the critic's targets (default: gae_lambda)"
+    )
     clip_range: float = Field(gt=0, description="limit of a probability's relative change in an update")
     ent_coef: float = Field(ge=0, description="weight of the entropy in the loss")
     vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
+    limit_coef: float = Field(
+        0.0, ge=0, description="weight of the squares by which mean actions exceed their limits in the loss"
+    )
     max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
     reward_scale: float = Field(gt=0, description="factor of the rewards")
     episode_share: float = Field(gt=0, le=1, description="share of its length after which an episode is cut")
@@ -247,6 +253,14 @@ class Experience(NamedTuple):
     final: Array  #: (T, n, frames * n_observation); episodes' last observations, at the steps where they end
 
 
+def later_sums(surprise: Array, over: NDArray[np.bool_], decay: float) -> Array:
+    """Return each step's surprise plus the later ones of its episode, weighted by powers of `decay`."""
+    sums, later = np.empty_like(surprise), np.zeros_like(surprise[0])
+    for t in reversed(range(len(surprise))):
+        later = sums[t] = surprise[t] + decay * ~over[t] * later
+    return sums
+
+
 class Learner:
     """Environments, networks and optimiser.
 
@@ -335,18 +349,20 @@ class Learner:
         """Return the advantages of the actions and the critic's targets, (T, n) each.
 
         A truncated episode would have continued: the value of its last observation stands for the rest.
+        The targets' lambda may be larger than the advantages' one. The critic then sees further ahead and
+        learns sooner that a state has become better, while the actor's estimates stay as steady as before.
         """
+        s = self.settings
         values = self.critic(torch.from_numpy(found.observations)).numpy()[..., 0]
         following = values[1:].copy()
         if found.over.any():
             following[found.over] = self.critic(torch.from_numpy(found.final[found.over])).numpy()[:, 0]
         following[found.terminated] = 0.0
-        gamma, decay = self.settings.gamma, self.settings.gamma * self.settings.gae_lambda
-        surprise = found.rewards + gamma * following - values[:-1]
-        advantages, later = np.empty_like(surprise), np.zeros_like(surprise[0])
-        for t in reversed(range(len(surprise))):
-            later = advantages[t] = surprise[t] + decay * ~found.over[t] * later
-        return advantages, advantages + values[:-1]
+        surprise = found.rewards + s.gamma * following - values[:-1]
+        advantages = later_sums(surprise, found.over, s.gamma * s.gae_lambda)
+        if s.td_lambda is None:
+            return advantages, advantages + values[:-1]
+        return advantages, later_sums(surprise, found.over, s.gamma * s.td_lambda) + values[:-1]
 
     def update(self, found: Experience, advantages: Array, targets: Array) -> None:
         """Improve actor and critic by several epochs of Adam on the collected experience."""
@@ -363,13 +379,19 @@ class Learner:
                 seen, gain = observations[batch], advantage[batch]
                 gain = (gain - gain.mean()) / (gain.std() + 1e-8)
                 features = body(seen)
-                log_prob, entropy = self.head.log_prob(features, last(features), actions[batch])
+                means = last(features)
+                log_prob, entropy = self.head.log_prob(features, means, actions[batch])
                 ratio = (log_prob - before[batch]).exp()
                 limited = ratio.clamp(1.0 - s.clip_range, 1.0 + s.clip_range)
                 better = torch.min(ratio * gain, limited * gain).mean()
                 off = (self.critic(seen)[:, 0] - target[batch]).square().mean()
+                loss = s.vf_coef * off - better - s.ent_coef * entropy.mean()
+                if s.limit_coef and not self.policy.choices:
+                    # Far beyond a limit noise changes nothing, so nothing would be learned there.
+                    beyond = (means.abs() / self.policy.largest - 1.0).clamp(min=0.0)
+                    loss = loss + s.limit_coef * beyond.square().mean()
                 self.gradient.zero_()
-                (s.vf_coef * off - better - s.ent_coef * entropy.mean()).backward()
+                loss.backward()
                 self.gradient.mul_((s.max_grad_norm / (self.gradient.norm() + 1e-6)).clamp(max=1.0))
                 self.adam.step()
 
@@ -429,7 +451,8 @@ def parser() -> argparse.ArgumentParser:
     )
     for name in OPTIONS:
         field = Settings.model_fields[name]
-        kind: Any = {float: float, bool: yes_or_no}.get(field.annotation, int)
+        kinds: dict[Any, Any] = {float: float, float | None: float, bool: yes_or_no}
+        kind = kinds.get(field.annotation, int)
         many: Any = {"nargs": "+"} if get_origin(field.annotation) is list else {}
         shown = "yes|no" if kind is yes_or_no else "X"
         group.add_argument(

@@ -202,9 +202,10 @@ def make_learner(env_id=ENV, **more):
     return ppo.Learner(env_id, settings, 0, 10_000)
 
 
-def test_advantages_are_sums_of_later_surprises():
+@pytest.mark.parametrize("td_lambda", [None, 0.95])
+def test_advantages_are_sums_of_later_surprises(td_lambda):
     """Against the definition, with episodes that are terminated, truncated and cut by the roll-out."""
-    learner = make_learner(n_steps=6, n_envs=2, batch_size=4, gamma=0.9, gae_lambda=0.8)
+    learner = make_learner(n_steps=6, n_envs=2, batch_size=4, gamma=0.9, gae_lambda=0.8, td_lambda=td_lambda)
     rng = np.random.default_rng(0)
     shape, wide = (6, 2), learner.observation.shape[1]
     over, terminated = np.zeros(shape, bool), np.zeros(shape, bool)
@@ -218,18 +219,22 @@ def test_advantages_are_sums_of_later_surprises():
     def value(observation):
         return learner.critic(torch.from_numpy(observation)).item()
 
+    def total(t, i, decay):
+        total, weight = 0.0, 1.0
+        for k in range(t, 6):
+            after = found.final[k, i] if over[k, i] else found.observations[k + 1, i]
+            rest = 0.0 if terminated[k, i] else 0.9 * value(after)
+            total += weight * (found.rewards[k, i] + rest - value(found.observations[k, i]))
+            weight *= 0.9 * decay
+            if over[k, i]:
+                break
+        return total
+
     for i in range(2):
         for t in range(6):
-            total, weight = 0.0, 1.0
-            for k in range(t, 6):
-                after = found.final[k, i] if over[k, i] else found.observations[k + 1, i]
-                rest = 0.0 if terminated[k, i] else 0.9 * value(after)
-                total += weight * (found.rewards[k, i] + rest - value(found.observations[k, i]))
-                weight *= 0.9 * 0.8
-                if over[k, i]:
-                    break
-            assert advantages[t, i] == pytest.approx(total, abs=1e-5)
-            assert targets[t, i] == pytest.approx(total + value(found.observations[t, i]), abs=1e-5)
+            assert advantages[t, i] == pytest.approx(total(t, i, 0.8), abs=1e-5)
+            expected = total(t, i, td_lambda or 0.8) + value(found.observations[t, i])
+            assert targets[t, i] == pytest.approx(expected, abs=1e-5)
 
 
 def test_rollouts_are_what_happened():
