@@ -70,7 +70,7 @@ class Settings(LearnerSettings):
     ent_coef: float = Field(ge=0, description="weight of the entropy in the loss")
     vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
     limit_coef: float = Field(
-        0.0, ge=0, description="weight of the squares by which mean actions exceed their limits in the loss"
+        0.0, ge=0, description="weight in the loss of the squares by which mean actions exceed their limits"
     )
     max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
     reward_scale: float = Field(gt=0, description="factor of the rewards")
@@ -349,8 +349,8 @@ class Learner:
         """Return the advantages of the actions and the critic's targets, (T, n) each.
 
         A truncated episode would have continued: the value of its last observation stands for the rest.
-        The targets' lambda may be larger than the advantages' one. The critic then sees further ahead and
-        learns sooner that a state has become better, while the actor's estimates stay as steady as before.
+        The targets may look further ahead than the advantages. The critic then learns sooner that a state has
+        become better, while the actor's estimates stay as steady as before.
         """
         s = self.settings
         values = self.critic(torch.from_numpy(found.observations)).numpy()[..., 0]

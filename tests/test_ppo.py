@@ -237,6 +237,22 @@ def test_advantages_are_sums_of_later_surprises(td_lambda):
             assert targets[t, i] == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("mean", "limit_coef", "moves"), [(3.0, 1.0, -1), (-3.0, 1.0, 1), (3.0, 0.0, 0), (0.9, 1.0, 0)]
+)
+def test_means_beyond_the_limits_cost_something(mean, limit_coef, moves):
+    """Where nothing else is to be learned, means beyond the limits move back, and others stay."""
+    learner = make_learner(n_steps=4, n_envs=2, batch_size=8, n_epochs=1, limit_coef=limit_coef)
+    last = learner.actor[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(mean)
+    found = learner.collect()
+    nothing = np.zeros_like(found.rewards)
+    learner.update(found, nothing, nothing)
+    assert np.sign(last.bias.item() - np.float32(mean)) == moves
+
+
 def test_rollouts_are_what_happened():
     learner = make_learner(episode_share=0.02)  # episodes of ten steps
     first = learner.observation.copy()

@@ -137,8 +137,8 @@ class SwingUp(GuardedTrack, _Bar):
         "ppo": {**_SCALED, "env_wrapper": [_SHORT], "gamma": 0.99},
         "off_policy": {"env_wrapper": [_SHORT]},
         # On the way to holding the bar up, every training lets it whirl, and some never slow it down again.
-        # A critic that sees further ahead learns sooner what holding it is worth. Means beyond the limits
-        # keep whirling bars at full speed.
+        # A critic that sees further ahead learns sooner what holding it is worth. Mean actions beyond the
+        # limits, which keep a bar whirling whatever the noise, cost something.
         "fast_ppo": {"n_timesteps": 5e5, "td_lambda": 0.97, "limit_coef": 0.1},
         # At the hanging rest h² has no gradient, so half of the episodes start anywhere. The track's end
         # is seconds away, so only the critic can price drifting towards it.
