@@ -286,7 +286,7 @@ def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
 
 def test_watch_opens_a_window_until_it_is_closed(window, capsys, monkeypatch):
     assert cli.main(["watch", ID, "--seed", "1", "--steps", "3"]) == 0
-    assert "PivotedBar-v0: PPO" in capsys.readouterr().out
+    assert f"{ID}: {shipped.shipped()[ID].name}\n" in capsys.readouterr().out
     assert cli.main(["watch", BALL, "--steps", "3", "--arrows", "--trail", "1", "--readout"]) == 0
     agent = watch.load_agent(ID, TASKS[ID](), "zero")[1]
     predict, seen = agent.predict, []
