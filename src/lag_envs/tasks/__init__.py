@@ -42,7 +42,7 @@ def load_task(place: str | type[Any]) -> type[Any]:
     UserError
         If the module exists but fails when it is imported; the error names the file.
     ValueError
-        For anything else that is not a task class, and does not lead to one.
+        For anything else that does not lead to a task class.
     """
     from lag_envs.tasks.base import Task
 
