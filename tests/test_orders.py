@@ -9,7 +9,7 @@ from lag_envs import orders
 from lag_envs.cli import main
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, incline
 from lag_envs.tasks.cart_pole import CartPoleExact
 
 EXAMPLE = str(Path(__file__).parents[1] / "examples" / "ball_on_beam.py")
@@ -40,10 +40,15 @@ def test_an_order_out_of_range_changes_nothing(order):
     assert envs.order == CartPoleExact.order
 
 
-def test_flows_have_none():
+def test_flows_have_none_that_can_be_set():
     assert LagrangianVectorEnv(PENDULUM, 2).order is None
-    with pytest.raises(UserError, match="a flow of its own"):
-        orders.measure_orders(PENDULUM)
+
+
+def test_a_series_with_a_flow_of_its_own_is_measured_too():
+    seen = []
+    times = orders.measure_orders(PENDULUM, 3, 1, advance=lambda: seen.append(1))
+    assert list(times) == list(orders.ORDERS) and len(seen) == len(times)
+    assert min(times.values()) > 0.0
 
 
 def test_the_best_is_the_lowest_of_the_fastest():
@@ -68,5 +73,7 @@ def test_command(capsys):
 
 
 def test_command_refuses_what_has_no_series(capsys):
-    assert main(["order", "PivotedBar-v0"]) == 2
-    assert "a flow of its own" in capsys.readouterr().err
+    with pytest.raises(UserError, match="moves on a slope"):
+        orders.measure_orders(incline.Brake)
+    assert main(["order", incline.Tilt.id]) == 2
+    assert "moves on a slope" in capsys.readouterr().err

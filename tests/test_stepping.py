@@ -93,7 +93,8 @@ def test_every_task_is_one_certified_step():
             bound = task.scene.step_bound(*case, task.dt)
             if bound.order:
                 pendulums.add(name)
-                assert bound.substeps <= (1 if bound.order == 14 else 2), (name, case)
+                easy = task.dt < 0.03 and isinstance(task.scene, PivotedBar)
+                assert bound.substeps <= (1 if easy else 2), (name, case)
                 speed = abs(case[0][form_of(task.scene).angle + 1])
                 size = 1.0 if bound.substeps == 1 else max(1.0, speed)
                 assert 0.0 < bound.bounds["theta"] < bound.bounds["theta_dot"] <= 1e-12 * size, (name, case)

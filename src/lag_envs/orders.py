@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Any
 
+from lag_envs.benchmark.environments import stepped
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
+from lag_envs.scenes.derivation import order_of
 from lag_envs.stepping.series import LARGEST_ORDER
 
-#: Only even orders: an odd order takes as much work as the next even order.
+#: Only even orders: in the general series an odd order takes as much work as the next even order.
 ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
 #: A lower order is preferred to an order that is faster by less than this factor, which is within the noise.
 SAME = 1.02
@@ -27,42 +29,37 @@ def measure_orders(
 ) -> dict[int, float]:
     """Return the time of a step [ns] for each order of the series.
 
-    One batch continues under random actions, with its episodes restarted as they end; each round steps it
-    with every order in turn. With any order, each step is certified to the same tolerance.
+    For each order a batch continues under the same random actions, with its episodes restarted as they end;
+    each round steps all batches in turn. With any order, each step is certified to the same tolerance.
 
     Parameters
     ----------
     task : type
-        A task whose scene has no flow of its own.
+        A task whose scene is stepped by a series.
     num_envs : int
-        Size of the batch.
+        Size of a batch.
     rounds : int
         Number of samples, each of `STEPS` steps.
     advance : callable
         Called after each sample.
     """
-    envs = LagrangianVectorEnv(task, num_envs)
-    if envs.order is None:
+    one = task()
+    if not order_of(one.scene, one.dt):
         raise UserError(
-            f"{task.__name__} has a flow of its own, since {type(envs.scene).__name__} moves like a pendulum "
-            "or on a slope; only orders of the general series are measured"
+            f"{task.__name__} is stepped in closed form or with an order that never changes, since "
+            f"{type(one.scene).__name__} moves on a slope"
         )
-    envs.reset(seed=0)
-    envs.action_space.seed(0)
-    actions = [envs.action_space.sample() for _ in range(64)]
-    # Let the ages of the episodes spread before measuring.
-    for action in actions * max(1, min(8, round(envs.task.limit / 64))):
-        envs.step(action)
+    runs = {
+        order: stepped(LagrangianVectorEnv(type(task.__name__, (task,), {"order": order}), num_envs))
+        for order in ORDERS
+    }
     samples: dict[int, list[float]] = {order: [] for order in ORDERS}
     for _ in range(rounds):
         for order, times in samples.items():
-            envs.order = order
             begin = time.perf_counter()
-            for action in actions[:STEPS]:
-                envs.step(action)
-            times.append((time.perf_counter() - begin) / (STEPS * num_envs) * 1e9)
+            steps = runs[order](STEPS)
+            times.append((time.perf_counter() - begin) / (steps * num_envs) * 1e9)
             advance()
-    envs.close()
     return {order: median(times) for order, times in samples.items()}
 
 

@@ -41,7 +41,8 @@ ORDER = Command(
     "order",
     "find the order of the series that steps a task fastest",
     """Measure the time of a step at each order of the series, under random actions in a task's own
-episodes, and report which order to write into the task. Every order meets the same tolerance.
+episodes, and report which order to write into the task. Every order meets the same tolerance. An
+agent may move faster than random actions do; with a higher order, fewer of its steps are divided.
 
 examples:
   lag-envs order ball_on_beam.py             a task of your own; this runs the file
