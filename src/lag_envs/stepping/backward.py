@@ -28,7 +28,7 @@ from lag_envs.stepping.target import Target
 
 
 class Backward(Series):
-    """The step of a record, forwards and backwards.
+    """The step of a record backwards.
 
     Parameters
     ----------
@@ -116,56 +116,33 @@ class Backward(Series):
         self,
         t: Any,
         inputs: dict[str, Any],
-        lane: StepProgress,
+        end: StepProgress,
         dt: Any,
         order: Any,
-        tolerance: Any,
         bars: Sequence,
-    ) -> tuple[StepProgress, list, Any]:
-        """Take a substep like `substep`; in lanes where this ends the control step, also take it backwards.
+    ) -> list:
+        """Take a substep backwards.
 
         Parameters
         ----------
-        t, inputs, lane, dt, order
+        t, inputs, dt, order
             See `substep`.
-        tolerance : number
-            Allowed truncation error of v. If negative, the substep was taken before and is only taken
-            backwards: `lane` is its end, and the lane's wish is its length.
+        end : StepProgress
+            The lane after the substep, with the substep's length in place of the next one's.
         bars : sequence of number
             Cotangents of places, then of velocities after the substep, then of the sources.
 
         Returns
         -------
-        lane : StepProgress
-            The lane after the substep.
-        bars : list of number
-            Cotangents before the substep in lanes that went backwards, with those of the sources added up;
-            then an estimate of what they leave out, relative to them.
-        back : condition
-            Whether lanes that ended their control step went backwards. They do not go backwards if they are
-            only a few of the lanes of a vector.
+        list of number
+            Cotangents before the substep, with those of the sources added up; then an estimate of what they
+            leave out, relative to them.
         """
-        zero, again, n = t.number(0.0), t.less(tolerance, t.number(0.0)), self.size
-        wanted = t.both(t.negated(again), t.less(zero, lane.left))
-
-        def forwards() -> list:
-            after, _ = self.substep(t, inputs, lane, dt, order, tolerance)
-            return [*after.q, *after.v, *after[2:]]
-
-        found = t.when(t.negated(t.all(again)), forwards, [*lane.q, *lane.v, *lane[2:]])
-        after = StepProgress(found[:n], found[n : 2 * n], *found[2 * n :])
-        ended = t.either(again, t.both(wanted, t.negated(t.less(zero, after.left))))
-        back = t.most(ended, wanted)
-        length = t.select(again, lane.wish, t.sub(lane.left, after.left))
-
-        def backwards() -> list:
-            here = self._inputs_at(t, inputs, dt, after.left)
-            start = self.expand(t, here, after.q, after.v, t.neg(length), order)
-            whole, rest, sizes = self._sweep(t, start, length, order, bars)
-            found = [t.select(ended, new, old) for new, old in zip(whole, bars, strict=True)]
-            return [*found, self._largest_ratio(t, length, rest, sizes, bars)]
-
-        return after, t.when(back, backwards, [*bars, zero]), back
+        length = end.wish
+        here = self._inputs_at(t, inputs, dt, end.left)
+        start = self.expand(t, here, end.q, end.v, t.neg(length), order)
+        found, rest, sizes = self._sweep(t, start, length, order, bars)
+        return [*found, self._largest_ratio(t, length, rest, sizes, bars)]
 
     def _largest_ratio(self, t: Target, h: Any, parts: Sequence, *wholes: Sequence) -> Any:
         """Return the largest ratio of parts of cotangents to their sizes before and after the step.

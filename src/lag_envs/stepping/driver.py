@@ -296,7 +296,7 @@ def _vjp_all(given, cotangents, found, longest, constants, starts, by_start, by_
     wanted, count = len(by_start), given.shape[1]
     order = min(order + further, LARGEST_ORDER)
     table, bars = np.zeros((bounds + wanted + 1, BLOCK)), np.empty((wanted, BLOCK))
-    again = np.zeros_like(table)
+    again, before = np.zeros_like(table), np.empty(BLOCK)
     for first in range(0, count, BLOCK):
         filled = min(BLOCK, count - first)
         for r in range(status):
@@ -304,15 +304,16 @@ def _vjp_all(given, cotangents, found, longest, constants, starts, by_start, by_
             for c in range(len(given)):
                 if starts[r, c] != 0.0:
                     add(table[r], starts[r, c], given[c, first:], filled)
-        inputs = table[:q].copy()
         for r in range(wanted):
             fill(bars[r], 0.0, BLOCK)
             for c in range(len(cotangents) if r < 2 * n else 0):
                 if by_end[c, r] != 0.0:
                     add(bars[r], by_end[c, r], cotangents[c, first:], filled)
             put(table[bounds + r], bars[r], BLOCK)
-        ends, lanes, rounds = forwards(table, bars, longest[first:], filled, dt, order)
-        stored(again, inputs, bars, ends, lanes, rounds, longest[first:], dt, order)
+        if not at_once(table, bars, before, longest[first:], filled, dt, order):
+            inputs = table[:q].copy()
+            ends, lanes, rounds = in_parts(table, wanted, before, longest[first:], filled, dt, order)
+            stored(again, inputs, bars, ends, lanes, rounds, longest[first:], dt, order)
         for r in range(len(found)):
             fill(found[r, first:], 0.0, filled)
             for c in range(len(cotangents)):
@@ -323,19 +324,45 @@ def _vjp_all(given, cotangents, found, longest, constants, starts, by_start, by_
                     add(found[r, first:], by_start[c, r], bars[c], filled)
 
 
-def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untyped-def]
-    """Take a block's control steps; a substep that ends one usually goes backwards at once, in `bars`.
+def _at_once(table, bars, before, longest, going, dt, order):  # type: ignore[no-untyped-def]
+    """Take the first substeps of a block; where all lanes of a vector are done, take them backwards too.
 
-    Lanes are moved together as in `_unfinished`. The ends of the other substeps are returned: columns of
-    places, velocities, what is left of the step, and the substep's length; then the lane of each, and the
-    number of them after each round.
+    Most steps take one substep, and are done with that. Return whether all are. Otherwise `before` is what
+    was left of each lane's step before its substep, 0 in lanes that are done.
     """
+    rows, left_out, done = table.reshape(-1), table[bounds + len(bars)], True
     fill(table[status], 0.0, BLOCK)
+    fill(table[span], dt, BLOCK)
     fill(table[left], 0.0, BLOCK)
     fill(table[left], dt, going)
-    whose, before = np.arange(BLOCK), np.empty(BLOCK)
+    put(before, table[left], BLOCK)
     for i in range(BLOCK):
         table[wish, i] = dt if i >= going or dt <= 1.001 * longest[i] else longest[i]
+    for begin in range(0, going, LANES):
+        attempt(rows, begin, order, tolerance)
+    for begin in range(0, going, LANES):
+        if above(table[left], 0.0, begin):
+            done = False
+            continue
+        fill(table[wish, begin:], dt, LANES)
+        fill(before[begin:], 0.0, LANES)
+        vjp(rows, begin, dt, order)
+        if above(left_out, COMPLETE, begin):
+            for i in range(begin, min(begin + LANES, going)):
+                longest[i] = min(longest[i], enough_of(dt, dt, left_out[i], order))
+    for r in range(len(bars)):
+        put(bars[r], table[bounds + r], going)
+    return done
+
+
+def _in_parts(table, wanted, before, longest, going, dt, order):  # type: ignore[no-untyped-def]
+    """Take the remaining substeps of the lanes that are not done, with what `_at_once` has left.
+
+    Lanes are moved together as in `_unfinished`. The ends of the substeps are returned: columns of places,
+    velocities, what is left of the step, and the substep's length; then the lane of each, and the number of
+    them after each round.
+    """
+    whose = np.arange(BLOCK)
     ends, lanes, rounds = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64), np.empty(64, np.int64)
     end, turns = 0, 0
     while going > 0:
@@ -344,57 +371,44 @@ def _forwards(table, bars, longest, going, dt, order):  # type: ignore[no-untype
             lanes = np.concatenate((lanes, np.empty_like(lanes)))
         if turns == len(rounds):
             rounds = np.concatenate((rounds, np.empty_like(rounds)))
-        put(before, table[left], BLOCK)
         still = 0
-        for begin in range(0, going, LANES):
-            back = vjp(table.reshape(-1), begin, dt, order, tolerance) > 0
-            until = min(begin + LANES, going)
-            if back and turns == 0 and at_once(table[left], table[bounds + len(bars)], begin):
-                for r in range(len(bars)):
-                    for i in range(begin, until):
-                        bars[r, i] = table[bounds + r, i]
-                continue  # the usual case needs no bookkeeping
-            if back:
-                for r in range(len(bars)):
-                    for i in range(begin, until):
-                        bars[r, whose[i]] = table[bounds + r, i]
-            for i in range(begin, until):
-                lane, remains = whose[i], table[left, i]
-                used = before[i] - remains
-                if used > 0.0 and back and remains == 0.0:
-                    enough = enough_of(used, dt, table[bounds + len(bars), i], order)
-                    longest[lane] = min(longest[lane], enough)
-                elif used > 0.0:
-                    for r in range(2 * n):
-                        ends[r, end] = table[q + r, i]
-                    ends[2 * n, end], ends[2 * n + 1, end] = remains, used
-                    lanes[end] = lane
-                    end += 1
-                if remains == 0.0:
-                    continue
-                if table[wish, i] > 1.001 * longest[lane]:
-                    table[wish, i] = longest[lane]
-                if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
-                    longest[lane] = 0.0
-                    continue
-                for r in range(bounds + len(bars)):
-                    table[r, still] = table[r, i]
-                whose[still] = lane
-                still += 1
+        for i in range(going):
+            lane, remains = whose[i], table[left, i]
+            used = before[i] - remains
+            if used > 0.0:
+                for r in range(2 * n):
+                    ends[r, end] = table[q + r, i]
+                ends[2 * n, end], ends[2 * n + 1, end] = remains, used
+                lanes[end] = lane
+                end += 1
+            if remains == 0.0:
+                continue
+            if table[wish, i] > 1.001 * longest[lane]:
+                table[wish, i] = longest[lane]
+            if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
+                longest[lane] = 0.0
+                continue
+            for r in range(bounds + wanted):
+                table[r, still] = table[r, i]
+            whose[still] = lane
+            still += 1
         for i in range(still, going):
             table[left, i] = 0.0
         going = still
         rounds[turns] = end
         turns += 1
+        put(before, table[left], going)
+        for begin in range(0, going, LANES):
+            attempt(table.reshape(-1), begin, order, tolerance)
     return ends, lanes, rounds[:turns]
 
 
-def _at_once(remains, left_out, begin):  # type: ignore[no-untyped-def]
-    """Return whether all these lanes took their step at once, with derivatives that leave out little."""
-    late = False
+def _above(row, limit, begin):  # type: ignore[no-untyped-def]
+    """Return whether an entry of these lanes is above the limit."""
+    found = False
     for i in range(begin, begin + LANES):
-        late |= (remains[i] > 0.0) | (left_out[i] > COMPLETE)
-    return not late
+        found |= row[i] > limit
+    return found
 
 
 def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # type: ignore[no-untyped-def]
@@ -412,7 +426,7 @@ def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # ty
             for r in range(len(bars)):
                 table[bounds + r, i] = bars[r, lane]
         for i in range(0, some, LANES):
-            vjp(table.reshape(-1), i, dt, order, -1.0)
+            vjp(table.reshape(-1), i, dt, order)
         for i in range(some):
             lane, used = lanes[begin + i], ends[2 * n + 1, begin + i]
             longest[lane] = min(longest[lane], enough_of(used, dt, table[bounds + len(bars), i], order))
@@ -439,15 +453,19 @@ def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
 @cache
 def compile_vjp_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
     """Compile ``vjp_all(given, cotangents, found, ..., dt, order)``, see `_vjp_all` and `compile_vjp`."""
-    width = max(4, registers().doubles)  # even small series need many numbers on the way back
     steep = any(node.op in STEEP for node in record.nodes)
     stricter, further = (STRICTER, FURTHER) if steep else (1.0, 0)
-    numbers = _numbers(record, TOLERANCE * stricter)
-    numbers |= {"BLOCK": BLOCK, "LANES": width, "further": further, "LARGEST_ORDER": LARGEST_ORDER}
-    vjp, enough_of = compile_vjp(record, sources, width), _compile_lengths()[0]
+    width = lanes(record)
+    numbers = _numbers(record, TOLERANCE * stricter) | {"BLOCK": BLOCK, "LANES": width}
+    attempt, vjp = compile_attempt(record, width), compile_vjp(record, sources, width)
+    enough_of = _compile_lengths()[0]
     fill, put, add = (compile_python(f.__name__[1:], f, inner=True) for f in (_fill, _put, _add))
-    at_once = compile_python("at_once", _at_once, inner=True, COMPLETE=COMPLETE, LANES=width)
-    helpers = vjp, enough_of, at_once, fill, put
-    forwards = compile_python("forwards", _forwards, *helpers, inner=True, **numbers)
+    above = compile_python("above", _above, inner=True, LANES=width)
+    at_once = compile_python(
+        "at_once", _at_once, attempt, vjp, enough_of, above, fill, put,
+        inner=True, COMPLETE=COMPLETE, **numbers,
+    )  # fmt: skip
+    in_parts = compile_python("in_parts", _in_parts, attempt, put, inner=True, **numbers)
     stored = compile_python("stored", _stored, vjp, enough_of, inner=True, **numbers)
-    return compile_python("vjp_all", _vjp_all, forwards, stored, fill, put, add, **numbers)
+    numbers |= {"further": further, "LARGEST_ORDER": LARGEST_ORDER}
+    return compile_python("vjp_all", _vjp_all, at_once, in_parts, stored, fill, put, add, **numbers)

@@ -147,13 +147,6 @@ class Machine:
         kind = ir.IntType(self._lanes)
         return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
 
-    def most(self, condition: Any, of: Any) -> ir.Value:
-        """Return whether a condition holds in at least two thirds of the lanes in which another holds."""
-        kind = ir.IntType(self._lanes)
-        count, total = (self._b.zext(self._b.ctpop(self._b.bitcast(x, kind)), _INT) for x in (condition, of))
-        three, two = ir.Constant(_INT, 3), ir.Constant(_INT, 2)
-        return self._b.icmp_unsigned(">=", self._b.mul(three, count), self._b.mul(two, total))
-
     def negated(self, condition: Any) -> ir.Value:
         return self._b.not_(condition)
 
@@ -497,12 +490,11 @@ def _write_tangent(
 
 
 def compile_vjp(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> Callable:
-    """Return ``vjp(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
+    """Return ``vjp(rows, at, dt, order)``: a substep backwards, for compiled code.
 
-    Rows are `BLOCK` numbers apart: those of `LaneLayout` up to `wish`, then cotangents of places and
-    velocities after the substep, and of the sources, and an estimate of what they leave out, relative to
-    them. All but the inputs are replaced. It returns 1 if the lanes that ended their step went backwards, see
-    `Backward.vjp`.
+    Rows are `BLOCK` numbers apart: those of `LaneLayout` up to `span` after the substep, with its length in
+    `wish`, then cotangents of places and velocities after the substep, and of the sources. The cotangents are
+    replaced by those before the substep. An estimate of what they leave out, relative to them, follows.
 
     Parameters
     ----------
@@ -514,7 +506,7 @@ def compile_vjp(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> C
         How many steps are taken at once.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {sources} {lanes} vjp".encode()).hexdigest()[:16]
-    kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE])
+    kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _DOUBLE, _INT])
     return _linked(
         f"vjp_{digest}", kind, lambda module, name: _write_vjp(module, name, kind, record, sources, lanes)
     )
@@ -523,12 +515,12 @@ def compile_vjp(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> C
 def _write_vjp(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, sources: tuple, lanes: int
 ) -> ir.Function:
-    """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
+    """Write the function ``name(rows, dt, order)`` into a module."""
     step, layout, n = Backward(record, sources), LaneLayout(record), record.size
     function = ir.Function(module, kind, name)
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
-    rows, dt, order, tolerance = function.args
+    rows, dt, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     t = Machine(builder, step.entries, lanes, True)
 
@@ -542,11 +534,9 @@ def _write_vjp(
 
     inputs = {name: read(row) for name, row in layout.inputs.items()}
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
-    before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
+    end = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
     bars = [read(layout.bounds + i) for i in range(2 * n + len(sources))]
-    lane, bars, back = step.vjp(t, inputs, before, t.broadcast(dt), order, t.broadcast(tolerance), bars)
-    for first, values in ((layout.q, [*lane.q, *lane.v, *lane[2:]]), (layout.bounds, bars)):
-        for row, value in enumerate(values, first):
-            builder.store(value, pointer(row)).align = 8
-    builder.ret(builder.zext(back, _INT))
+    for row, value in enumerate(step.vjp(t, inputs, end, t.broadcast(dt), order, bars), layout.bounds):
+        builder.store(value, pointer(row)).align = 8
+    builder.ret_void()
     return function

@@ -205,14 +205,10 @@ class SeriesTangent:
         given = np.empty((size + controls.shape[1], len(states)))
         given[:size], given[size:] = states.T, controls.T  # three times as fast as np.concatenate
         found, longest = np.empty((self._width, len(states))), np.full(len(states), dt)
-        rows: Any = np.arange(len(states))
-        some: Any = slice(None)
-        while len(rows):  # first all rows, then those whose substeps were too long for the derivatives
-            before, parts = longest[some], [np.ascontiguousarray(x[:, some]) for x in (given, seeds, found)]
-            shorter = before.copy()
-            self._vjp(*parts, shorter, *linear, dt, self._order(dt))
-            given_up, too_long = rows[shorter == 0.0], rows[(0.0 < shorter) & (shorter < before)]
-            found[:, some], longest[some] = parts[-1], shorter
+        self._vjp(given, seeds, found, longest, *linear, dt, self._order(dt))
+        rows = np.flatnonzero(longest < dt)
+        while len(rows):  # substeps were too long for the derivatives
+            given_up = rows[longest[rows] == 0.0]
             # In reverse mode no substep is longer than the shortest, so there may be too many substeps. In
             # forward mode substeps grow again.
             if len(given_up):
@@ -220,7 +216,12 @@ class SeriesTangent:
                 if refused:
                     return None, int(given_up[refused - 1]) + 1
                 found[:, given_up] = np.einsum("ni,nij->jn", cotangents[given_up], slopes)
-            some = rows = too_long
+            rows = rows[longest[rows] > 0.0]
+            before, parts = longest[rows], [np.ascontiguousarray(x[:, rows]) for x in (given, seeds, found)]
+            shorter = before.copy()
+            self._vjp(*parts, shorter, *linear, dt, self._order(dt))
+            found[:, rows], longest[rows] = parts[-1], shorter
+            rows = rows[shorter < before]
         return found.T, 0
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
