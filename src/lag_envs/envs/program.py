@@ -464,15 +464,17 @@ class Program:
     def _special_lanes(self) -> list[str]:
         """The loops that list the lanes that have taken no ordinary step, and that go through the list.
 
-        Without a list, each lane would need a branch. In some processes all of these were mispredicted, and
-        steps took nearly twice as long.
+        Without a list, each lane would need a branch; in some processes, steps took nearly twice as long.
         """
-        place = f"par[{self._scratch} + np.uint64({BLOCK * self.scratch.index('lane')}) + {{}}]"
-        listed, chosen = f"{place.format('found')} = i", f"i = np.uint64({place.format('j')})"
+        end, entry = (self._scratch_rows_at(place) for place in ("found", "j"))
+        listed = [*self._load(["ordinary"]), *end.store(["lane"], ["np.float64(i)"])]
         return [
             "found = np.uint64(0)",
-            *indented(EACH_LANE, [*self._load(["ordinary"]), listed, "found += np.uint64(ordinary != 1.0)"]),
-            *indented("for j in range(special):", [chosen, *self._special_step]),
+            *indented(EACH_LANE, [*listed, "found += np.uint64(ordinary != 1.0)"]),
+            *indented(
+                "for j in range(special):",
+                [*entry.load(["lane"]), "i = np.uint64(lane)", *self._special_step],
+            ),
         ]
 
     @property
@@ -678,7 +680,10 @@ class Program:
 
     @property
     def _scratch_rows(self) -> Rows:
-        return Rows(self.scratch, "par", f"{self._scratch} + i", BLOCK)
+        return self._scratch_rows_at("i")
+
+    def _scratch_rows_at(self, place: str) -> Rows:
+        return Rows(self.scratch, "par", f"{self._scratch} + {place}", BLOCK)
 
     @property
     def _scratch(self) -> str:
