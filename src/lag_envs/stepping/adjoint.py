@@ -182,7 +182,7 @@ class LaneFormula:
         arrays = [f"given{i}" for i in range(len(inputs))], [f"found{i}" for i in range(len(found))]
         body = [
             "wide_vectors()",
-            f"rows, count = np.empty({len(row) * LANES}), np.uint64(found0.shape[0])",
+            f"rows, count = aligned_zeros({len(row) * LANES}), np.uint64(found0.shape[0])",
             *(f"{constant} = numbers[{j}]" for j, constant in enumerate(constants)),
             f"for block in range(np.uint64((found0.shape[0] + {LANES - 1}) // {LANES})):",
             f"    first = block * np.uint64({LANES})",

@@ -295,63 +295,69 @@ def _vjp_all(given, cotangents, found, longest, constants, starts, by_start, by_
     """
     wanted, count = len(by_start), given.shape[1]
     order = min(order + further, LARGEST_ORDER)
-    table, bars = np.zeros((bounds + wanted + 1, BLOCK)), np.empty((wanted, BLOCK))
-    again, before = np.zeros_like(table), np.empty(BLOCK)
+    table = aligned_zeros((bounds + wanted + 1) * BLOCK).reshape((bounds + wanted + 1, BLOCK))
+    bars, before = np.empty((wanted, BLOCK)), np.empty(BLOCK)
     for first in range(0, count, BLOCK):
         filled = min(BLOCK, count - first)
         for r in range(status):
-            fill(table[r], constants[r], BLOCK)
+            fill(table, r, 0, constants[r], BLOCK)
             for c in range(len(given)):
                 if starts[r, c] != 0.0:
-                    add(table[r], starts[r, c], given[c, first:], filled)
+                    add(table, r, 0, starts[r, c], given, c, first, filled)
         for r in range(wanted):
-            fill(bars[r], 0.0, BLOCK)
+            fill(bars, r, 0, 0.0, BLOCK)
             for c in range(len(cotangents) if r < 2 * n else 0):
                 if by_end[c, r] != 0.0:
-                    add(bars[r], by_end[c, r], cotangents[c, first:], filled)
-            put(table[bounds + r], bars[r], BLOCK)
-        if not at_once(table, bars, before, longest[first:], filled, dt, order):
+                    add(bars, r, 0, by_end[c, r], cotangents, c, first, filled)
+            put(table, bounds + r, bars, r, BLOCK)
+        if not at_once(table, bars, before, longest, first, filled, dt, order):
             inputs = table[:q].copy()
             ends, lanes, rounds = in_parts(table, wanted, before, longest[first:], filled, dt, order)
-            stored(again, inputs, bars, ends, lanes, rounds, longest[first:], dt, order)
+            stored(table, inputs, bars, ends, lanes, rounds, longest[first:], dt, order)
         for r in range(len(found)):
-            fill(found[r, first:], 0.0, filled)
+            fill(found, r, first, 0.0, filled)
             for c in range(len(cotangents)):
                 if by_end[c, 2 * n + r] != 0.0:
-                    add(found[r, first:], by_end[c, 2 * n + r], cotangents[c, first:], filled)
+                    add(found, r, first, by_end[c, 2 * n + r], cotangents, c, first, filled)
             for c in range(wanted):
                 if by_start[c, r] != 0.0:
-                    add(found[r, first:], by_start[c, r], bars[c], filled)
+                    add(found, r, first, by_start[c, r], bars, c, 0, filled)
 
 
-def _at_once(table, bars, before, longest, going, dt, order):  # type: ignore[no-untyped-def]
+def _at_once(table, bars, before, longest, first, going, dt, order):  # type: ignore[no-untyped-def]
     """Take the first substeps of a block; where all lanes of a vector are done, take them backwards too.
 
     Most steps take one substep, and are done with that. Return whether all are. Otherwise `before` is what
-    was left of each lane's step before its substep, 0 in lanes that are done.
+    was left of each lane's step before its substep, 0 in lanes that are done. `longest` has the block's lanes
+    from `first` on.
     """
-    rows, left_out, done = table.reshape(-1), table[bounds + len(bars)], True
-    fill(table[status], 0.0, BLOCK)
-    fill(table[span], dt, BLOCK)
-    fill(table[left], 0.0, BLOCK)
-    fill(table[left], dt, going)
-    put(before, table[left], BLOCK)
+    rows, left_out, done = table.reshape(-1), bounds + len(bars), True
+    fill(table, status, 0, 0.0, BLOCK)
+    fill(table, span, 0, dt, BLOCK)
+    fill(table, left, 0, 0.0, BLOCK)
+    fill(table, left, 0, dt, going)
     for i in range(BLOCK):
-        table[wish, i] = dt if i >= going or dt <= 1.001 * longest[i] else longest[i]
+        before[i] = table[left, i]
+        table[wish, i] = dt
+    for i in range(going):
+        limit = longest[np.uint64(first + i)]
+        table[wish, i] = dt if dt <= 1.001 * limit else limit
     for begin in range(0, going, LANES):
         attempt(rows, begin, order, tolerance)
     for begin in range(0, going, LANES):
-        if above(table[left], 0.0, begin):
+        if above(table, left, begin, 0.0):
             done = False
             continue
-        fill(table[wish, begin:], dt, LANES)
-        fill(before[begin:], 0.0, LANES)
+        fill(table, wish, begin, dt, LANES)
+        for i in range(LANES):
+            before[np.uint64(begin + i)] = 0.0
         vjp(rows, begin, dt, order)
-        if above(left_out, COMPLETE, begin):
+        if above(table, left_out, begin, COMPLETE):
             for i in range(begin, min(begin + LANES, going)):
-                longest[i] = min(longest[i], enough_of(dt, dt, left_out[i], order))
+                lane = first + i
+                longest[lane] = min(longest[lane], enough_of(dt, dt, table[left_out, i], order))
     for r in range(len(bars)):
-        put(bars[r], table[bounds + r], going)
+        put(bars, r, table, bounds + r, going)
     return done
 
 
@@ -397,17 +403,18 @@ def _in_parts(table, wanted, before, longest, going, dt, order):  # type: ignore
         going = still
         rounds[turns] = end
         turns += 1
-        put(before, table[left], going)
+        for i in range(going):
+            before[i] = table[left, i]
         for begin in range(0, going, LANES):
             attempt(table.reshape(-1), begin, order, tolerance)
     return ends, lanes, rounds[:turns]
 
 
-def _above(row, limit, begin):  # type: ignore[no-untyped-def]
+def _above(table, r, begin, limit):  # type: ignore[no-untyped-def]
     """Return whether an entry of these lanes is above the limit."""
     found = False
-    for i in range(begin, begin + LANES):
-        found |= row[i] > limit
+    for i in range(LANES):
+        found |= table[r, np.uint64(begin + i)] > limit
     return found
 
 
@@ -435,19 +442,23 @@ def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # ty
                 bars[r, lanes[begin + i]] = table[bounds + r, i]
 
 
-def _fill(row, value, count):  # type: ignore[no-untyped-def]
+# These take a table and the number of a row, since Numba would count references to a row, which costs as much
+# as the rest. For unsigned places see `_unfinished`.
+
+
+def _fill(table, r, begin, value, count):  # type: ignore[no-untyped-def]
     for i in range(count):
-        row[i] = value
+        table[r, np.uint64(begin + i)] = value
 
 
-def _put(row, values, count):  # type: ignore[no-untyped-def]
+def _put(table, r, other, s, count):  # type: ignore[no-untyped-def]
     for i in range(count):
-        row[i] = values[i]
+        table[r, np.uint64(i)] = other[s, np.uint64(i)]
 
 
-def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
+def _add(table, r, begin, weight, other, s, start, count):  # type: ignore[no-untyped-def]
     for i in range(count):
-        row[i] += weight * values[i]
+        table[r, np.uint64(begin + i)] += weight * other[s, np.uint64(start + i)]
 
 
 @cache
@@ -465,7 +476,7 @@ def compile_vjp_all(record: SeriesRecord, sources: tuple[str, ...]) -> Callable:
         "at_once", _at_once, attempt, vjp, enough_of, above, fill, put,
         inner=True, COMPLETE=COMPLETE, **numbers,
     )  # fmt: skip
-    in_parts = compile_python("in_parts", _in_parts, attempt, put, inner=True, **numbers)
+    in_parts = compile_python("in_parts", _in_parts, attempt, inner=True, **numbers)
     stored = compile_python("stored", _stored, vjp, enough_of, inner=True, **numbers)
     numbers |= {"further": further, "LARGEST_ORDER": LARGEST_ORDER}
     return compile_python("vjp_all", _vjp_all, at_once, in_parts, stored, fill, put, add, **numbers)

@@ -244,6 +244,13 @@ def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
     return types.void(), codegen
 
 
+@njit(forceinline=True)
+def aligned_zeros(count):  # type: ignore[no-untyped-def]
+    """Return zeros that begin at the start of a cache line, so that each vector is on one line."""
+    room = np.zeros(count + 7)
+    return room[-(room.ctypes.data // 8) % 8 :][:count]
+
+
 def block(operations: Sequence[Operation], inputs: Sequence[str], outputs: Sequence[Any]) -> Callable:
     """Return a function that carries out recorded operations, written directly in LLVM's language.
 
@@ -414,6 +421,7 @@ NAMES = {
     "write_rows": write_rows,
     "copy_rows": copy_rows,
     "wide_vectors": wide_vectors,
+    "aligned_zeros": aligned_zeros,
     "address": address,
     "moved": moved,
     "atomic_load": atomic_load,
