@@ -38,9 +38,13 @@ test: setup  ## run the tests and doctests, all but the slow ones
 	@sh tools/browser
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
+# Times of frames would suffer from tests that run beside them.
+ALONE = tests/test_drive_speed.py
+
 test-slow: setup  ## install what the slow tests need (Pinocchio, Ray, the RL Zoo) and run them; it prints how long it took
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,pinocchio,ray,zoo]'
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow --no-skips --durations 20 $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow --no-skips --durations 20 $(or $(ARGS),--ignore $(ALONE))
+	$(if $(ARGS),,$(BIN)/python -m pytest -m slow --no-skips $(ALONE))
 
 notebooks: setup  ## run the notebooks in full, from the wheel (minutes); the tests run a shorter version
 	$(BIN)/python -m pytest -m slow --no-skips -s tests/test_notebooks.py $(ARGS)

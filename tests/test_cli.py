@@ -20,7 +20,7 @@ from lag_envs.leaderboard import shipped
 from lag_envs.leaderboard.board import Board
 from lag_envs.scores import score
 from lag_envs.starter import filled
-from lag_envs.tasks import cart_pole, pivoted_bar
+from lag_envs.tasks import acrobot, cart_pole, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
@@ -195,6 +195,9 @@ def test_info_shows_imperfections_and_where_formulas_are(capsys):
     assert cli.main(["info", BALL]) == 0
     out = capsys.readouterr().out
     assert "  off: randomize, observation_noise" in out and f"see {BALL}" in out
+    assert cli.main(["info", acrobot.AcrobotReal.id]) == 0
+    out = capsys.readouterr().out
+    assert "leaderboards [1]:" in out and "\n[1] F. Wiebe" in out
 
 
 # --- what ships ---

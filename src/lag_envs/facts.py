@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -71,8 +72,9 @@ def _indented(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def _description(task: Task) -> str:
-    """Return the class's docstring up to its tables."""
+    """Return the class's docstring up to its tables, with its references as plain text."""
     text = inspect.getdoc(type(task)) or ""
+    text = re.sub(r"(?m)^\.\. (?=\[\d+\] )|(?<=\[\d\])_", "", text)
     summary, _, rest = text.partition("\n\n## Description\n\n")
     return (
         f"{summary}\n\n{rest.partition(chr(10) * 2 + '## ')[0]}" if rest else summary.partition("\n\n## ")[0]
