@@ -442,8 +442,8 @@ def _stored(table, inputs, bars, ends, lanes, rounds, longest, dt, order):  # ty
                 bars[r, lanes[begin + i]] = table[bounds + r, i]
 
 
-# These take a table and the number of a row, since Numba would count references to a row, which costs as much
-# as the rest. For unsigned places see `_unfinished`.
+# These take a table and the number of a row, since Numba would count references to a row, by atomic
+# operations. For unsigned places see `_unfinished`.
 
 
 def _fill(table, r, begin, value, count):  # type: ignore[no-untyped-def]
