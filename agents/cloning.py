@@ -21,7 +21,7 @@ import torch
 from pydantic import Field
 
 from agents.learners import LAYERS, Count, LearnerSettings, Width, trainable
-from agents.ppo import Policy, network, shared_weights
+from agents.policy import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.controllers import build
 from lag_envs.envs.stagger import stagger

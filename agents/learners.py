@@ -623,7 +623,9 @@ def load_policy(folder: str | Path) -> Any:
     result = read_result(folder / RESULT)
     try:
         if result["algo"] in OWN:
-            return import_module(OWN[result["algo"]].module).Policy.load(folder / MODEL)
+            from agents.policy import Policy  # loads PyTorch
+
+            return Policy.load(folder / MODEL)
         model = learner(result["algo"]).load(folder / MODEL, device="cpu", **export.LOADING)
         file = folder / NORMALISATION
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None

@@ -40,7 +40,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
 from agents.learners import LAYERS, Count, LearnerSettings, Width, check_rewards, trainable
-from agents.ppo import Policy, network, shared_weights
+from agents.policy import Policy, network, shared_weights
 from agents.run import UserError, first_training_seed
 from lag_envs.torch import Step
 

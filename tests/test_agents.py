@@ -13,6 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from agents import bench, demo, ppo, race, report, scale, train, tune
+from agents.policy import Policy
 from lag_envs.controllers import make_controller
 from lag_envs.errors import UserError
 from lag_envs.evaluation.rollout import play
@@ -386,7 +387,7 @@ def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
         folder = runs / env_id / "fast_ppo" / f"seed{seed}"
         folder.mkdir(parents=True)
         layer = np.zeros((1, len(TASKS[env_id]().observation)), np.float32), np.array([push], np.float32)
-        ppo.Policy([layer], ()).save(folder / "model.zip")
+        Policy([layer], ()).save(folder / "model.zip")
         result = {"schema": 1, "env": env_id, "algo": "fast_ppo", "seed": seed, "trained": 1, "steps": 1}
         result |= {"wall_seconds": 1.0, "mean_return": mean, "score": 0.0, "curve": [], "hyperparameters": {}}
         (folder / "result.json").write_text(json.dumps(result | {"evaluation": {"returns": []}}))

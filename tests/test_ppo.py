@@ -15,6 +15,7 @@ from trainings import OTHERS, go, here, kill_and_interrupt, short_evaluations
 import lag_envs
 from agents import learners, ppo, race, submit, train, tune
 from agents.learners import load_policy, zoo_hyperparameters
+from agents.policy import Policy
 from agents.run import CHECKPOINT, MODEL, RESULT, Run, UserError, fresh_seeds
 from lag_envs import TASKS, watch
 from lag_envs.evaluation.rollout import play
@@ -444,9 +445,9 @@ def test_networks_of_any_actions_act_as_on_the_leaderboard(task, frames, tmp_pat
     outputs, file = sum(formulas.choices) or formulas.actions, tmp_path / MODEL
     draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
     layers = [(draw(8, frames * wide), draw(8)), (draw(outputs, 8), draw(outputs))]
-    ppo.Policy(layers, formulas.choices, formulas.largest, frames).save(file)
+    Policy(layers, formulas.choices, formulas.largest, frames).save(file)
     table, arrays = arrays_of(file)
-    submitted, policy = architecture(task.id, table).agent(arrays), ppo.Policy.load(file)
+    submitted, policy = architecture(task.id, table).agent(arrays), Policy.load(file)
     states = [None] * 4
     for _ in range(6):  # some episodes begin anew
         seen, start = draw(200, wide), rng.random(200) < 0.2
