@@ -40,7 +40,7 @@ NETWORK = {"architecture": "mlp", "hidden": [256, 256], "activation": "relu", "s
 def test_a_frame_takes_eight_milliseconds_at_most(drive, id, ghost, tmp_path):
     """In at least one of three drives, as the machine may be busy; that lengthens painting most of all.
 
-    A tenth of the whole frames may take longer: short episodes start or end in that many.
+    Of the whole frames one in fifty may take longer.
     """
     data = board_pages.data((id,), board_pages.AGENTS[:1])
     if ghost:
@@ -48,7 +48,7 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, id, ghost, tmp_path):
     write_page(data, tmp_path)
     drives = (frames(drive(id, folder=tmp_path), bool(ghost)) for _ in range(3))
     assert any(
-        len(whole) > 30 and np.quantile(scripts, 0.99) <= 8.0 and np.quantile(whole, 0.9) <= 8.0
+        len(whole) > 30 and np.quantile(scripts, 0.99) <= 8.0 and np.quantile(whole, 0.98) <= 8.0
         for scripts, whole in drives
     )
 

@@ -271,10 +271,9 @@ function open(root, board, code, tools) {
   /** A return, and its score if the episode is whole. */
   const resultOf = (episode) => `return ${text(episode.total, 2)}${known && finished(episode) ? `, score ${text(scoreOf(episode))}` : ""}`;
 
-  const tell = (words, spoken = words) => {
-    message.textContent = words;
-    said.textContent = spoken;
-  };
+  /** Writes to the page and to screen readers: `tell` does them at once, `inTurn` each in a frame of its own. */
+  const telling = (words, spoken = words) => [() => (message.textContent = words), () => (said.textContent = spoken)];
+  const tell = (...words) => telling(...words).forEach((write) => write());
 
   // --- ghosts
 
@@ -473,28 +472,31 @@ function open(root, board, code, tools) {
     const told = entries(ghostAt(1));
     inTurn(
       () => writeList(readout, told), // not visible yet
-      () => {
-        readOut(told);
-        label();
-      },
-      () => finish(words),
+      markStage,
+      () => readOut(told),
+      nameButtons,
+      showAgain,
+      ...telling(ending(words)),
       () => idly(offer),
     );
   }
 
-  function finish(words) {
-    const ending = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
+  /** What to say at the end of a drive. */
+  function ending(words) {
+    const over = words || { terminated: "The episode has ended", truncated: "Time is up", refused: "The next step was refused, because it cannot be computed to full accuracy" }[me.over];
     const result = untouched() ? resultOf(me) : `return ${text(me.total, 2)}, not scored`;
     const beside = ghost && ghostAt(1) ? `; ${ghost.name}: return ${text(ghostAt(1).total, 2)} by then` : "";
     const next = touched ? "Restart repeats this start; New start draws another."
       : `Press R to ${rerunning ? "drive from this start" : "try again"}, N for another start.`;
-    tell(`${ending}: ${result}${beside}. ${next}`);
+    return `${over}: ${result}${beside}. ${next}`;
   }
 
-  function setLink(value) {
-    link.value = value;
+  const linking = (value) => [() => (link.value = value), () => (copy.disabled = !value)];
+  const setLink = (value) => linking(value).forEach((write) => write());
+
+  /** Say where the link will be what will stand there. */
+  function invite() {
     link.placeholder = untouched() ? "Your drive's link, once it stops" : "Drives of a changed machine have no link";
-    copy.disabled = !value;
   }
 
   /** Offer the link of this drive. */
@@ -529,13 +531,27 @@ function open(root, board, code, tools) {
     beat = requestAnimationFrame(frame);
   }
 
-  function label() {
+  /** Mark the stage while somebody drives. */
+  function markStage() {
     stage.toggleAttribute("data-driving", running);
     readout.setAttribute("aria-hidden", running); // `spoken` replaces it
     spoken.setAttribute("aria-hidden", !running);
+  }
+
+  function nameButtons() {
     for (const starts of [go, again, fresh]) starts.disabled = loading();
-    again.hidden = ended(); // `go` does the same then
     go.textContent = running ? "Pause" : ended() ? "Restart" : me.steps ? "Resume" : "Start";
+  }
+
+  /** Show the button that restarts, unless `go` does that. It keeps its place, so that nothing else moves. */
+  function showAgain() {
+    again.style.visibility = ended() ? "hidden" : "";
+  }
+
+  function label() {
+    markStage();
+    nameButtons();
+    showAgain();
   }
 
   function run() {
@@ -544,11 +560,10 @@ function open(root, board, code, tools) {
     tapped = null;
     shownAt = 0;
     note();
-    message.textContent = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
+    const words = rerunning ? "Watching the link's drive: you do not steer. Space pauses, R lets you drive."
       : waiting() ? `Time begins with your first ${touched ? "touch" : "key"}.` : "";
-    said.textContent = message.textContent || "Driving";
     cancelAnimationFrame(beat); // of a drive that was stopped within this frame
-    inTurn(label, offer, (time) => {
+    inTurn(...telling(words, words || "Driving"), nameButtons, showAgain, ...linking(""), markStage, (time) => {
       before = time;
       beat = requestAnimationFrame(frame);
     });
@@ -706,6 +721,7 @@ function open(root, board, code, tools) {
       machine.functions.derive(constants);
     }
     picture = look();
+    invite();
     restart();
     if (machine !== last) warmUp();
     const usual = ghost?.replays ? " The recorded ghost drives the unchanged one." : "";
@@ -946,6 +962,7 @@ function open(root, board, code, tools) {
   window.addEventListener("hashchange", followHash);
 
   listGhosts();
+  invite();
   restart();
   warmUp();
   tell(starting(how), starting(heard));

@@ -1325,6 +1325,12 @@
     });
     startFilm();
   }
+  // With each change of the page a browser copies all canvases, even those out of sight, unless it is told to skip them.
+  const sight = new IntersectionObserver(
+    (entries) => entries.forEach(({ target, isIntersecting }) => target.toggleAttribute("data-away", !isIntersecting)),
+    { rootMargin: "100px" },
+  );
+  all("canvas").forEach((canvas) => sight.observe(canvas));
   const again = () => redraw.forEach((each) => each?.());
   again();
   let width = 0;
