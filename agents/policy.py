@@ -1,7 +1,7 @@
 """Networks of our own learners, and the policy that acts with them.
 
-Learners train networks of PyTorch. To act, they use the same weights in NumPy, which is faster for few
-observations, and the leaderboard's arithmetic when it counts.
+Networks are trained in PyTorch. Learners collect experience with the same weights in NumPy, which is faster
+for few observations; a finished policy acts in float64, exactly as on the leaderboard.
 """
 
 from __future__ import annotations
