@@ -1,8 +1,4 @@
-"""Networks of our own learners, and the policy that acts with them.
-
-Networks are trained in PyTorch. Learners collect experience with the same weights in NumPy, which is faster
-for few observations; a finished policy acts in float64, exactly as on the leaderboard.
-"""
+"""Networks of our own learners, and the policy that acts with them."""
 
 from __future__ import annotations
 

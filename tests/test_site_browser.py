@@ -541,6 +541,16 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     assert page.evaluate(moved)
 
 
+def test_canvases_out_of_sight_are_skipped_but_keep_their_names(open_page):
+    """Otherwise the browser copies all of them with each change of the page."""
+    page = open_page()
+    skipped = "getComputedStyle(document.querySelector('{}')).contentVisibility === 'hidden'"
+    for seen, other in itertools.permutations((".hero canvas", ".traces canvas")):
+        page.locator(seen).scroll_into_view_if_needed()
+        until(page, f"!({skipped.format(seen)}) && {skipped.format(other)}")
+        assert page.get_by_role("img", name="Action and reward over time").count() == 1
+
+
 def test_the_documentations_choice_of_light_or_dark_is_followed(open_page, documented):
     """By pictures too, and when it changes; if anything else is stored, the system's is."""
     key, root = "/.__palette", f"{documented}/board"

@@ -491,6 +491,7 @@ function open(root, board, code, tools) {
     return `${over}: ${result}${beside}. ${next}`;
   }
 
+  /** Writes to the link's field and its button, like `telling`. */
   const linking = (value) => [() => (link.value = value), () => (copy.disabled = !value)];
   const setLink = (value) => linking(value).forEach((write) => write());
 
