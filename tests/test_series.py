@@ -171,7 +171,7 @@ def certified(system, generator, order, tolerance, count):
 
 
 #: Orders and tolerances; loose ones come close to the radius of convergence.
-SETTINGS = ((6, 1e-5), (9, TOLERANCE), (10, 1e-9), (16, TOLERANCE))
+SETTINGS = ((3, 1e-3), (6, 1e-5), (9, TOLERANCE), (10, 1e-9), (16, TOLERANCE))
 
 
 # --- the certificate ----------------------------------------------------------------------------------------
@@ -363,11 +363,11 @@ def block_steps(system, cases, dt, order, fused=True, **options):
     return rows[layout.q : layout.status + 1, : len(cases)].T
 
 
-def single_steps(system, cases, dt, order, fused=True):
+def single_steps(system, cases, dt, order, fused=True, **options):
     """Return the same from the function for a single lane."""
     record = record_of(system, fused)
     layout, rows = LaneLayout(record), rows_of(system, cases)
-    advance, results = compile_advance(record, fused=fused), []
+    advance, results = compile_advance(record, fused=fused, **options), []
     for lane in range(len(cases)):
         one = np.zeros(layout.rows)
         one[: layout.status] = rows[: layout.status, lane]
@@ -433,6 +433,17 @@ def test_bits_depend_neither_on_the_width_nor_on_the_neighbours(system, width, f
         state, control = cases[lane]
         end = simulate(system.scene, state, [control], 0.02, 16, fused)[1, 2 * system.driven :]
         np.testing.assert_array_equal([*end[::2], *end[1::2]], alone[lane, :-1])
+
+
+@pytest.mark.parametrize("order", [3, slow(4), 5, slow(6), slow(7), slow(10)])
+@pytest.mark.parametrize("system", every(4, SYSTEMS), ids=NAMES)
+def test_code_for_a_fixed_order_gives_the_same_bits(system, order):
+    generator = np.random.default_rng(10)
+    cases = [system.draw(generator, 10.0 ** generator.uniform(-2, 0.3)) for _ in range(20)]
+    loops = single_steps(system, cases, 0.02, order, tolerance=1e-3)
+    fixed = {"tolerance": 1e-3, "fixed_order": order}
+    np.testing.assert_array_equal(single_steps(system, cases, 0.02, order, **fixed), loops)
+    np.testing.assert_array_equal(block_steps(system, cases, 0.02, order, **fixed), loops)
 
 
 class Polar(Scene):

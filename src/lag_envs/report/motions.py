@@ -156,14 +156,16 @@ class CertifiedSeries(Rival):
     """The general engine at an order and a tolerance, each step certified, in its shipped loops.
 
     The setting is the tolerance. Single states run in the loop of `Scene.simulate`, batches in the block
-    function of the vector environments; both take one control step from each state.
+    function of the vector environments; both take one control step from each state. Orders below `LOOPS` are
+    compiled for that order alone.
     """
 
     family = "lag_envs"
+    LOOPS = 8
 
     def __init__(self, order: int, tolerance: float) -> None:
         super().__init__(f"lag_envs, order {order}", tolerance)
-        self.order = order
+        self.order, self._fixed_order = order, order if order < self.LOOPS else None
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile."""
@@ -173,7 +175,7 @@ class CertifiedSeries(Rival):
         starts, controls, count = problems.starts, problems.controls, len(problems)
         width, order = starts.shape[1], float(self.order)
         if not together:
-            alone = _alone(code, self.setting)
+            alone = _alone(code, self.setting, self._fixed_order)
             ends = np.empty_like(starts)
 
             def run() -> None:
@@ -181,7 +183,7 @@ class CertifiedSeries(Rival):
                     raise ArithmeticError("a step was refused")
 
             return Sample(run, count, ends=ends.copy)
-        batch = _batch(code, self.setting)
+        batch = _batch(code, self.setting, self._fixed_order)
         begin = blocks(np.concatenate([starts, controls], axis=1).T, BLOCK)
         memory = np.zeros((len(begin), begin.shape[1] + len(code.rows) + 1, BLOCK))
 
@@ -196,7 +198,7 @@ class CertifiedSeries(Rival):
 
 
 @cache
-def _alone(code: Any, tolerance: float) -> Callable:
+def _alone(code: Any, tolerance: float, fixed_order: int | None) -> Callable:
     """Compile ``alone(starts, controls, ends, dt, order, constants...)``: a control step from each state."""
     lines = [
         f"rows = np.zeros({code.scratch})",
@@ -210,11 +212,11 @@ def _alone(code: Any, tolerance: float) -> Callable:
         "return refused",
     ]
     arguments = ", ".join(["starts, controls, ends, dt, order", *code.constants])
-    return compile_lines("alone", arguments, lines, code.compile(tolerance))
+    return compile_lines("alone", arguments, lines, code.compile(tolerance, fixed_order))
 
 
 @cache
-def _batch(code: Any, tolerance: float) -> Callable:
+def _batch(code: Any, tolerance: float, fixed_order: int | None) -> Callable:
     """Compile ``batch(memory, count, dt, order, constants...)``: a control step of all lanes, block by block.
 
     A block has rows for state and controls, then those of `SeriesCode.rows`, and one more.
@@ -250,4 +252,4 @@ def _batch(code: Any, tolerance: float) -> Callable:
         "return refused",
     ]
     arguments = ", ".join(["memory, count, dt, order", *code.constants])
-    return compile_lines("batch", arguments, lines, code.compile_block(tolerance))
+    return compile_lines("batch", arguments, lines, code.compile_block(tolerance, fixed_order))

@@ -130,9 +130,11 @@ def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, Any]:
 
 
 @cache
-def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True) -> Callable:
-    """Compile ``advance(rows, dt, order)``, see `_advance`; `compile_attempt` says what `fused` is."""
-    attempt = compile_attempt(record, 1, fused)
+def compile_advance(
+    record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True, fixed_order: int | None = None
+) -> Callable:
+    """Compile ``advance(rows, dt, order)``, see `_advance`; `compile_attempt` says what the rest is."""
+    attempt = compile_attempt(record, 1, fused, fixed_order)
     return compile_python("advance_lane", _advance, attempt, **_numbers(record, tolerance))
 
 
@@ -148,7 +150,11 @@ def lanes(record: SeriesRecord) -> int:
 
 @cache
 def compile_advance_block(
-    record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True, width: int | None = None
+    record: SeriesRecord,
+    tolerance: float = TOLERANCE,
+    fused: bool = True,
+    width: int | None = None,
+    fixed_order: int | None = None,
 ) -> Callable:
     """Compile ``advance(memory, base, count, order)``, see `_advance_block`.
 
@@ -158,14 +164,14 @@ def compile_advance_block(
         What is stepped.
     tolerance : float
         What a substep may leave out, relative to the size of the velocities.
-    fused : bool
+    fused, fixed_order
         See `compile_attempt`.
     width : int, optional
         How many lanes are stepped at once; by default `lanes`. The bits do not depend on it.
     """
     width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
-    attempt = compile_attempt(record, width, fused)
+    attempt = compile_attempt(record, width, fused, fixed_order)
     unfinished = compile_python("unfinished", _unfinished, attempt, **numbers)
     return compile_python("advance_block", _advance_block, attempt, unfinished, **numbers)
 

@@ -328,15 +328,16 @@ class SeriesCode:
         """The arguments of `advance`."""
         return ", ".join(["rows", *self.start, *self.controls, "dt", "order", *self.constants])
 
-    def compile(self, tolerance: float = TOLERANCE) -> Callable:
+    def compile(self, tolerance: float = TOLERANCE, fixed_order: int | None = None) -> Callable:
         """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., applied..., status)``.
 
         The status is the number of attempts, or negative if the step is refused. The sums of the substeps'
         bounds on places and velocities are left at the end of `rows`, which has `scratch` numbers.
+        `compile_attempt` says what `fixed_order` is.
         """
         results = ", ".join([*self.end, *self.applied, "status"])
         body = [*self.any_step, f"return {results}"]
-        return compile_lines("advance", self.arguments, body, self.engine(tolerance))
+        return compile_lines("advance", self.arguments, body, self.engine(tolerance, fixed_order))
 
     @property
     def any_step(self) -> list[str]:
@@ -352,11 +353,11 @@ class SeriesCode:
             *self.finish,
         ]
 
-    def engine(self, tolerance: float = TOLERANCE) -> Callable:
+    def engine(self, tolerance: float = TOLERANCE, fixed_order: int | None = None) -> Callable:
         """Return the function that the lines of `any_step` call."""
         from lag_envs.stepping.driver import compile_advance
 
-        return compile_advance(self.record, tolerance, self._fused)
+        return compile_advance(self.record, tolerance, self._fused, fixed_order)
 
     def bounded(
         self,
@@ -381,11 +382,11 @@ class SeriesCode:
         """The function that `compile_simulate` makes."""
         return self.compile_simulate()
 
-    def compile_block(self, tolerance: float = TOLERANCE) -> Callable:
+    def compile_block(self, tolerance: float = TOLERANCE, fixed_order: int | None = None) -> Callable:
         """Compile ``advance_block(memory, base, count, order)`` on `rows` of BLOCK lanes."""
         from lag_envs.stepping.driver import compile_advance_block
 
-        return compile_advance_block(self.record, tolerance, self._fused)
+        return compile_advance_block(self.record, tolerance, self._fused, fixed_order=fixed_order)
 
     def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, order, constants...)``.

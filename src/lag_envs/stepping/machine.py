@@ -175,9 +175,13 @@ class Machine:
         return self._b.add(k, ir.Constant(_INT, n))
 
     def minus(self, a: Any, b: Any) -> ir.Value:
+        if isinstance(a, ir.Constant) and isinstance(b, ir.Constant):
+            return ir.Constant(_INT, a.constant - b.constant)
         return self._b.sub(a, b)
 
     def half(self, k: Any) -> ir.Value:
+        if isinstance(k, ir.Constant):
+            return ir.Constant(_INT, k.constant // 2)
         return self._b.lshr(k, ir.Constant(_INT, 1))
 
     def below(self, a: Any, b: Any) -> ir.Value:
@@ -207,6 +211,11 @@ class Machine:
         return lambda: [b.load(place) for place in at]
 
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
+        if isinstance(first, ir.Constant) and isinstance(end, ir.Constant):
+            values = list(carried)
+            for k in range(first.constant, end.constant, step):
+                values = body(ir.Constant(_INT, k), values)
+            return values
         b = self._b
         start = b.basic_block
         head, inside, after = (b.append_basic_block(name) for name in ("head", "inside", "after"))
@@ -332,7 +341,9 @@ def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
 
 
 @cache
-def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
+def compile_attempt(
+    record: SeriesRecord, lanes: int, fused: bool = True, fixed_order: int | None = None
+) -> Callable:
     """Return ``attempt(rows, at, order, tolerance)``, to be called from compiled code.
 
     It takes a step of each lane for which something is left, of the length that is wished for or of a part of
@@ -348,16 +359,29 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
         several lanes.
     fused : bool, default True
         Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
+    fixed_order : int, optional
+        The only order for which the function is called. All loops over orders are then written out. The bits
+        are the same. It pays for low orders: the code grows with the square of the order.
     """
-    digest = hashlib.sha256(f"{_version()} {record.digest} {lanes} {fused}".encode()).hexdigest()[:16]
+    digest = hashlib.sha256(
+        f"{_version()} {record.digest} {lanes} {fused} {fixed_order}".encode()
+    ).hexdigest()[:16]
     kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _INT, _DOUBLE])
     return _linked(
-        f"attempt_{digest}", kind, lambda module, name: _write(module, name, kind, record, lanes, fused)
+        f"attempt_{digest}",
+        kind,
+        lambda module, name: _write(module, name, kind, record, lanes, fused, fixed_order),
     )
 
 
 def _write(
-    module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, lanes: int, fused: bool
+    module: ir.Module,
+    name: str,
+    kind: ir.FunctionType,
+    record: SeriesRecord,
+    lanes: int,
+    fused: bool,
+    fixed_order: int | None,
 ) -> ir.Function:
     """Write the function ``name(rows, order, tolerance)`` into a module."""
     step, layout, n = Series(record), LaneLayout(record), record.size
@@ -365,6 +389,8 @@ def _write(
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order, tolerance = function.args
+    if fixed_order is not None:
+        order = ir.Constant(_INT, fixed_order)
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     t = Machine(builder, step.slots * STRIDE, lanes, fused)
     apart = 1 if lanes == 1 else BLOCK
