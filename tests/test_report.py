@@ -185,11 +185,7 @@ def test_command_line_errors(tmp_path, capsys):
             ["report", "--docs", "nowhere", str(tmp_path / "new")],
             f"--docs: {Path('nowhere/README.md')} is missing",
         ),
-        (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs needs a whole report"),
-        (
-            ["report", "--sections", "bound", "--docs", ".", str(tmp_path / "new")],
-            "--docs needs a whole report",
-        ),
+        (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs needs a full report"),
     ):
         assert main(arguments) == 2
         assert message in capsys.readouterr().err
@@ -262,6 +258,21 @@ def test_compact_form(written, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert docs.main([]) == 0 and " missed." in readme.read_text()
     assert (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8") == page
+    # A report of one section leaves the others, and says where it was measured itself.
+    stored, figures = tmp_path / "docs" / "accuracy.json", tmp_path / "docs" / "images" / "accuracy"
+    whole = json.loads(stored.read_text(encoding="utf-8"))
+    other = whole["sections"][0] | {"name": "other", "pictures": [{"file": "kept.svg", "caption": "Kept."}]}
+    machine = whole["machine"] | {"processor": "Abacus"}
+    stored.write_text(json.dumps(whole | {"machine": machine, "sections": [*whole["sections"], other]}))
+    for name in ("kept.svg", "lost.svg"):
+        (figures / name).write_text("<svg/>")
+    assert docs.main([str(written), str(tmp_path)]) == 0
+    found = json.loads(stored.read_text(encoding="utf-8"))
+    assert found["machine"] == machine and found["sections"][1] == other
+    assert found["sections"][0]["about"]["machine"] == whole["machine"]
+    assert {path.name for path in figures.iterdir()} == {"kept.svg", "dots.png", "dummy.svg", "overview.png"}
+    page = (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    assert page.count("*Measured apart from the other sections: ") == 1 == page.count("Abacus, ")
 
 
 def test_without_a_report_or_its_compact_form(tmp_path, monkeypatch, capsys):

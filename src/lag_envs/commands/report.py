@@ -40,7 +40,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     declare_date(parser, "on the page")
     parser.add_argument(
-        "--docs", metavar="PROJECT", help="afterwards, write the accuracy pages of this checkout's docs"
+        "--docs", metavar="PROJECT", help="afterwards, update the accuracy pages of this checkout's docs"
     )
 
 
@@ -67,8 +67,8 @@ def run_report(args: argparse.Namespace) -> int:
             if name not in SECTIONS:
                 raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     if args.docs:
-        if args.quick or names != SECTIONS:
-            raise UserError("--docs needs a whole report: leave out --quick and --sections")
+        if args.quick:
+            raise UserError("--docs needs a full report: leave out --quick")
         check_checkout("--docs", args.docs)
     if not make_report(ReportSettings(folder, args.quick, names, args.processes, args.date, file)):
         return 130
@@ -116,7 +116,8 @@ examples:
   lag-envs report --quick                            a first look, in under a minute
   lag-envs report                                    everything, in about half an hour on two cores
   lag-envs report --docs .                           the same, and update this checkout's docs
-  lag-envs report --sections bound,stability maps    two parts, into the folder maps
+  lag-envs report --sections bound,stability maps    two parts, into the folder maps; with --docs, only
+                                                     these parts of the docs are updated
   lag-envs report ball_on_beam.py                    scenes of your own, into report-ball_on_beam;
                                                      this runs the file""",
     declare_report,

@@ -2,8 +2,9 @@
 
 From a report's folder it writes into a checkout: ``docs/accuracy.json`` (tables, claims, machine, versions),
 the figures, and the pages that depend on that file alone: ``docs/accuracy.md``, a page to read, and
-``docs/accuracy-details.md`` with all texts, tables and figures. Without a report's folder it writes the pages
-and the first figure again from ``docs/accuracy.json``. A test makes the texts again and compares.
+``docs/accuracy-details.md`` with all texts, tables and figures. A report of some sections replaces these and
+leaves the others as they are. Without a report's folder it writes the pages and the first figure again from
+``docs/accuracy.json``. A test makes the texts again and compares.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from lag_envs.tables import markdown_table
 
 FIGURES = "images/accuracy"
 LARGEST_SVG = 200_000  #: bytes
+#: What is said about a measurement.
+ABOUT = ("machine", "versions", "settings", "job_seconds")
 DETAILS = "accuracy-details.md"
 OVERVIEW = ReportFigure(
     "overview",
@@ -140,15 +143,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{args.report} is not complete; `lag-envs report {args.report}` resumes it", file=sys.stderr)
         return 2
     docs = args.project / "docs"
-    figures = docs / FIGURES
+    stored, figures = docs / "accuracy.json", docs / FIGURES
+    old = json.loads(stored.read_text(encoding="utf-8")) if stored.is_file() else {"sections": []}
+    kept = [section for section in old["sections"] if section["name"] not in found["sections"]]
     figures.mkdir(parents=True, exist_ok=True)
-    for old in figures.iterdir():
-        old.unlink()
+    for path in figures.iterdir():
+        if path.name not in {picture["file"] for section in kept for picture in section["pictures"]}:
+            path.unlink()
     contents = content_of(found)
     files = {p.name: drawn_figure(p, figures).name for content in contents.values() for p in content.pictures}
-    write_file(docs / "accuracy.json", json.dumps(compact(found, files), indent=1, allow_nan=False) + "\n")
+    new = compact(found, files)
+    if kept:
+        new = combined(old, new)
+    write_file(stored, json.dumps(new, indent=1, allow_nan=False) + "\n")
     update(args.project)
     return 0
+
+
+def combined(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Return the old report with the new one's sections, each with what is said about its measurement."""
+    about = {key: new[key] for key in ABOUT}
+    found = {section["name"]: section | {"about": about} for section in new["sections"]}
+    sections = [found.pop(section["name"], section) for section in old["sections"]]
+    return old | {"sections": [*sections, *found.values()]}
 
 
 def update(project: Path) -> None:
@@ -202,7 +219,7 @@ def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
                 "problems": [f"{p['name']}: {p['problem']}" for p in found["sections"][name]["problems"]],
             }
         )
-    about = {key: found[key] for key in ("machine", "versions", "settings", "job_seconds")}
+    about = {key: found[key] for key in ABOUT}
     about["settings"] = {key: about["settings"][key] for key in ("quick", "date")}
     return about | {"sections": sections}
 
@@ -242,6 +259,7 @@ def accuracy_markdown(accuracy: dict[str, Any]) -> str:
                 parts += _picture(picture)
         if section["summary"]:
             parts.append(_table(section["summary"]))
+        parts += _own_machine(section)
         parts += [f"{_holding(section['claims'])}.", _command(part.section)]
         parts.append(f"[Method, all tables and figures]({DETAILS}#{_anchor(section['title'])})")
     parts += ["## What does not hold", _holding(claims) + (". These do not:" if broken else ".")]
@@ -278,7 +296,7 @@ def details(accuracy: dict[str, Any]) -> str:
     parts = ["# Accuracy: details", "This is the full report; read [Accuracy](accuracy.md) first."]
     parts += _about(accuracy)
     for section in accuracy["sections"]:
-        parts += [f"## {section['title']}", *section["text"]]
+        parts += [f"## {section['title']}", *_own_machine(section), *section["text"]]
         if section["claims"]:
             rows = [
                 (claim["text"], f"**{page.VERDICTS[claim['holds']]}**", claim["evidence"])
@@ -317,12 +335,24 @@ def _command(sections: str) -> str:
 
 
 def _about(accuracy: dict[str, Any]) -> list[str]:
-    machine = accuracy["machine"]
-    return [
-        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']};"
-        f" {accuracy['settings']['date']}; {page.cell_text(accuracy['job_seconds'])} s of work.",
-        ", ".join(f"{name} {number}" for name, number in accuracy["versions"].items()) + ".",
-    ]
+    versions = ", ".join(f"{name} {number}" for name, number in accuracy["versions"].items())
+    return [_machine(accuracy), f"{versions}."]
+
+
+def _own_machine(section: dict[str, Any]) -> list[str]:
+    """Return where and when a section was measured, if apart from the others."""
+    if "about" not in section:
+        return []
+    return [f"*Measured apart from the other sections: {_machine(section['about'])}*"]
+
+
+def _machine(about: dict[str, Any]) -> str:
+    machine = about["machine"]
+    vectors = f", vectors of {machine['vector']} doubles" if "vector" in machine else ""
+    return (
+        f"{machine['processor']}{vectors}, {machine['cores']} cores, {machine['system']}, Python "
+        f"{machine['python']}; {about['settings']['date']}; {page.cell_text(about['job_seconds'])} s of work."
+    )
 
 
 def _anchor(title: str) -> str:

@@ -16,6 +16,7 @@ from lag_envs.errors import UserError
 from lag_envs.host import machine
 from lag_envs.report.content import Content
 from lag_envs.report.runner import JobResult, module, run_jobs, versions
+from lag_envs.stepping.machine import registers
 from lag_envs.tables import aligned
 
 #: Modules of this package, in the order of the page.
@@ -88,7 +89,7 @@ def collect_rows(
     """Return all measurements, by section."""
     return {
         "complete": complete,
-        "machine": machine(),
+        "machine": machine() | {"vector": registers().doubles},
         "versions": versions(),
         "settings": asdict(settings) | {"sections": list(settings.sections)},
         "seconds": round(seconds, 1),
