@@ -162,7 +162,7 @@ def in_python(name, source, *helpers, inner=False, **constants):
     return scope[name]
 
 
-def advance_in_python(record, tolerance=TOLERANCE, fused=False):
+def advance_in_python(record, tolerance=TOLERANCE, fused=False, fixed_order=None):
     """Replace `compile_advance`: the driver's own code on `Plain`."""
     series, layout, n = Series(record), LaneLayout(record), record.size
 

@@ -211,7 +211,7 @@ class Machine:
         return lambda: [b.load(place) for place in at]
 
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
-        if isinstance(first, ir.Constant) and isinstance(end, ir.Constant):
+        if isinstance(first, ir.Constant) and isinstance(end, ir.Constant):  # for a fixed order
             values = list(carried)
             for k in range(first.constant, end.constant, step):
                 values = body(ir.Constant(_INT, k), values)
@@ -381,7 +381,7 @@ def _write(
     record: SeriesRecord,
     lanes: int,
     fused: bool,
-    fixed_order: int | None,
+    fixed_order: int | None = None,
 ) -> ir.Function:
     """Write the function ``name(rows, order, tolerance)`` into a module."""
     step, layout, n = Series(record), LaneLayout(record), record.size
