@@ -67,8 +67,9 @@ PARTS = (
         "general",
         "One step of scenes defined by energies alone",
         "Here the equations are derived from the energies and stepped by the general Taylor series, which "
-        "certifies each step. The other methods give no bound, so only a comparison with exact solutions "
-        "shows which of their settings reach an error.",
+        "certifies each step. Environments step at the tightest tolerance, by code for any order; looser "
+        "tolerances, and code for one low order, serve these comparisons only. The other methods give no "
+        "bound, so only a comparison with exact solutions shows which of their settings reach an error.",
         ("general-double",),
     ),
     PagePart(
@@ -147,8 +148,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     old = json.loads(stored.read_text(encoding="utf-8")) if stored.is_file() else {"sections": []}
     kept = [section for section in old["sections"] if section["name"] not in found["sections"]]
     figures.mkdir(parents=True, exist_ok=True)
+    shown = {picture["file"] for section in kept for picture in section["pictures"]}
     for path in figures.iterdir():
-        if path.name not in {picture["file"] for section in kept for picture in section["pictures"]}:
+        if path.name not in shown:
             path.unlink()
     contents = content_of(found)
     files = {p.name: drawn_figure(p, figures).name for content in contents.values() for p in content.pictures}

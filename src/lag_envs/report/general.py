@@ -48,7 +48,7 @@ HEYOKA: Sequence[float] = (*TOLERANCES, 1e-15)
 CERTIFIED: Sequence[tuple[float, int]] = tuple(
     (tolerance, order)
     for tolerance in TOLERANCES
-    for order in (3, 4, 5, 6, 7, *range(8, 25, 2))
+    for order in (*range(3, CertifiedSeries.LOOPS), *range(CertifiedSeries.LOOPS, 25, 2))
     if -math.log10(tolerance) <= order <= 6.0 - 2.0 * math.log10(tolerance)
 )
 #: Settings of the other methods.

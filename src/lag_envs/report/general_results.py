@@ -118,13 +118,14 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "errors are those of the timed calls, at the fastest setting that reaches the given "
             "error.",
             "lag_envs certifies each step, at a tolerance and an order; below order 8 its code is compiled "
-            "for that order alone, with loops written out. The others give no bound: which setting reaches "
-            "an error is known here only from the exact ends. heyoka runs with fast_math, without compact "
-            "mode (loops written out), its compiled step in a compiled loop, in a batch in blocks of two "
-            "widths. MuJoCo runs its own model in compiled rollouts, by Euler, implicitfast and RK4; "
-            "Pinocchio its articulated-body algorithm in RK4 steps in a C++ loop. For both, a moving support "
-            "is modelled by an inertial force in its own frame. RK4, DOP853 and Radau IIA take fixed steps "
-            "and are compiled like lag_envs.",
+            "for that order alone, with loops written out. Environments always step at a tolerance of "
+            f"{TOLERANCE:g}, by code for any order. The others give no bound: which setting reaches an "
+            "error is known here only from the exact ends. heyoka runs with fast_math, without compact mode "
+            "(loops written out), its compiled step in a compiled loop, in a batch in blocks of two widths. "
+            "MuJoCo runs its own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its "
+            "articulated-body algorithm in RK4 steps in a C++ loop. For both, a moving support is modelled "
+            "by an inertial force in its own frame. RK4, DOP853 and Radau IIA take fixed steps and are "
+            "compiled like lag_envs.",
             *([f"Not compared: {absent}."] if absent else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],

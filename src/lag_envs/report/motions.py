@@ -153,11 +153,11 @@ class SceneProblems(Problems):
 
 
 class CertifiedSeries(Rival):
-    """The general engine at an order and a tolerance, each step certified, in its shipped loops.
+    """The general engine at an order and a tolerance, each step certified.
 
     The setting is the tolerance. Single states run in the loop of `Scene.simulate`, batches in the block
-    function of the vector environments; both take one control step from each state. Orders below `LOOPS` are
-    compiled for that order alone.
+    function of the vector environments; both take one control step from each state. Below the order `LOOPS`
+    they call code for that order alone, which no environment does.
     """
 
     family = "lag_envs"
