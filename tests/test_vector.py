@@ -591,6 +591,25 @@ def test_a_refusal_carries_what_the_others_did():
     assert error.value.results[-1]["refused"].tolist() == [True, False, True, True]
 
 
+@pytest.mark.parametrize("diagnostics", [False, True])
+def test_a_refusal_loses_no_episode_that_ends(diagnostics):
+    given = {"gravity": [9.81, 1e12], "duration": 0.04, "diagnostics": diagnostics}
+    envs = gym.make_vec("DoubleBar-v0", num_envs=2, autoreset_mode="SameStep", **given)
+    twin = gym.make_vec("DoubleBar-v0", num_envs=1, autoreset_mode="SameStep", **given | {"gravity": 9.81})
+    envs.reset(seed=5), twin.reset(seed=5)
+    for end in (False, True, False, True):
+        with pytest.raises(StepRefused, match="the step of environment 1 was refused") as error:
+            envs.step(np.zeros((2, 1), np.float32))
+        found, expected = error.value.results, twin.step(np.zeros((1, 1), np.float32))
+        assert found[-1]["refused"].tolist() == [False, True] and found[3].tolist() == [end, False]
+        for x, y in zip(found[:4], expected[:4], strict=True):
+            assert np.array_equal(x[:1], y)
+        assert ("final_obs" in found[-1]) == end
+        if end:
+            assert np.array_equal(found[-1]["final_obs"][0], expected[-1]["final_obs"][0])
+            assert found[-1]["final_obs"][1] is None and found[-1]["_final_obs"].tolist() == [True, False]
+
+
 def test_it_tells_limits_and_which_episodes_are_over():
     envs = gym.make_vec("PivotedBar-v0", 3, max_episode_steps=2).unwrapped
     envs.reset(seed=1)

@@ -489,7 +489,7 @@ class Program:
                 *self._inputs, *self._to_end_again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
-                *indent([*self._store(["over", "r"], ["0.0", "np.nan"]), *refused]),  # not a reward: the mark
+                *indent([*self._store(["over", "r"], ["0.0", "REFUSED"]), *refused]),
                 "else:",
                 *indent([
                     *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),

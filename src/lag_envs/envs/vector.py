@@ -33,6 +33,7 @@ from lag_envs.envs.interface import (
 from lag_envs.envs.program import BLOCK
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
+from lag_envs.stepping.primitives import is_refused
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -317,15 +318,16 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
         self._over = over
         observations = observations.T
         infos = self._infos(None)
-        if status > 0:
-            infos["refused"] = np.isnan(rewards)
-            rewards[infos["refused"]] = 0.0
+        refused = is_refused(rewards) if status > 0 else None
+        if refused is not None:
+            rewards[refused] = 0.0
         if self._over and self.autoreset_mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
         if self._seen:
-            self._count(rewards)
+            self._count(rewards, refused)
         results = observations, rewards, terminations, truncations, infos
-        if status > 0:
+        if refused is not None:
+            infos["refused"] = refused
             raise self._refusal(results)
         return results
 
@@ -504,10 +506,10 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
                     self._viewed[i] = values
                     viewer.use(self.tasks[i].varied(**values))
 
-    def _count(self, rewards: NDArray[np.float64]) -> None:
+    def _count(self, rewards: NDArray[np.float64], refused: NDArray[np.bool_] | None) -> None:
         """Count steps and rewards of the episodes."""
-        begun = self._read("n") == 0.0
-        self._steps = np.where(begun, 0, self._steps + 1)
+        begun, taken = self._read("n") == 0.0, 1 if refused is None else ~refused
+        self._steps = np.where(begun, 0, self._steps + taken)
         self._totals = np.where(begun, 0.0, self._totals + rewards)
 
     @property

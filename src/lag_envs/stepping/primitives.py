@@ -22,6 +22,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from lag_envs.stepping.tracing import BOOLEAN, MAGIC, Operation
 
@@ -411,10 +412,22 @@ def _integers(kind: ir.Type) -> ir.Type:
     return ir.VectorType(_INT, kind.count) if isinstance(kind, ir.VectorType) else _INT
 
 
+_REFUSED_BITS = np.uint64(0x7FF8_0000_5EF0_5ED0)
+#: What a batch gives as the reward of a step that was refused: NaN, with bits that no computation gives. A
+#: task's own reward may be NaN too.
+REFUSED = float(_REFUSED_BITS.view(np.float64))
+
+
+def is_refused(rewards: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return where a reward is `REFUSED`."""
+    return rewards.view(np.uint64) == _REFUSED_BITS
+
+
 #: Names that the source of a compiled function may use.
 NAMES = {
     "np": np,
     "math": math,
+    "REFUSED": REFUSED,
     "fma": fma,
     "select": select,
     "read_rows": read_rows,
