@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from covering import every
+from numba.core import codegen
 
 from lag_envs.cli import main
 from lag_envs.stepping import cache, machine
@@ -181,6 +182,19 @@ def test_a_file_that_may_not_be_read(place):
     expected = int(os.access(path, os.R_OK))  # an administrator may
     assert hits() == expected
     assert hits() == 1
+
+
+def test_ctrl_c_while_llvm_hands_over_the_code(place, monkeypatch):
+    # The exception is lost in LLVM's callback, and then there is no code to keep.
+    function = cache.jit(double, "some source")
+    with monkeypatch.context() as interrupted:
+        lost = property(lambda library: None, lambda library, code: None)
+        interrupted.setattr(codegen.CPUCodeLibrary, "_compiled_object", lost, raising=False)
+        with pytest.raises(KeyboardInterrupt):
+            function(1.5)
+    assert function(1.5) == 3.0
+    assert not files(place)
+    assert (hits(), hits()) == (0, 1)
 
 
 @pytest.mark.skipif(resource is None, reason="this system has no limit on the size of files")

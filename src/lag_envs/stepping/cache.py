@@ -174,8 +174,13 @@ class _DispatcherCache:
         if place is None or result.lifted or result.library.has_dynamic_globals:
             return
         path, key = self._entry(place, types, result.codegen)
+        try:
+            content = _reduce(result)
+        except RuntimeError as error:  # there is no compiled object
+            # LLVM hands it over in a callback, where an exception is lost: as a rule, that of Ctrl-C.
+            raise KeyboardInterrupt from error
         with contextlib.suppress(OSError):
-            _save(path, key, _reduce(result))
+            _save(path, key, content)
 
     def _entry(self, place: Path, types: Any, codegen: Any) -> tuple[Path, bytes]:
         """Return the file for these types on this machine, and the digest of everything it depends on."""
