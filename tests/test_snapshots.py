@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import subprocess
 import sys
@@ -173,6 +174,24 @@ def test_other_ranges_are_refused():
     snapshot = snapshots.Snapshot(other.unwrapped._about, {}, *[np.zeros(1)] * 3)
     with pytest.raises(ValueError, match=r"randomize is .* 3.0, .* in the snapshot, and .* 2.0, .* here"):
         here.unwrapped.set_state(snapshot)
+
+
+@pytest.mark.parametrize("damage", ["rows", "ids", "steps", "totals"])
+@pytest.mark.parametrize("many", [False, True])
+def test_a_damaged_snapshot_changes_nothing(many, damage):
+    env = (gym.make_vec(ID, num_envs=2) if many else gym.make(ID)).unwrapped
+    env.reset(seed=1)
+    good = env.get_state()
+    rows = dict(good.rows)
+    if damage == "rows":
+        rows[list(rows)[-1]] = 0.5
+    changes = {"rows": rows} if damage == "rows" else {damage: getattr(good, damage)[:0]}
+    env.step(env.action_space.sample())
+    before = env.get_state()
+    with pytest.raises(ValueError, match=r"snapshot is damaged: .* must be an array of numbers of shape"):
+        env.set_state(dataclasses.replace(good, **changes))
+    for name, values in env.get_state().rows.items():
+        assert np.array_equal(values, before.rows[name])
 
 
 def test_other_batches_are_refused():

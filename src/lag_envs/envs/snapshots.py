@@ -73,6 +73,15 @@ def check_snapshot(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) 
             )
     if set(rows) != set(snapshot.rows):
         raise ValueError("this snapshot was made by another version of lag_envs and has other numbers")
+    n = here["num_envs"] or 1
+    shapes = dict.fromkeys(rows, (n,)) | {"ids": (3, n), "steps": (n,), "totals": (n,)}
+    for name, shape in shapes.items():
+        found = snapshot.rows[name] if name in rows else getattr(snapshot, name)
+        if not isinstance(found, np.ndarray) or found.shape != shape or found.dtype.kind not in "fiu":
+            raise ValueError(
+                f"this snapshot is damaged: {name} must be an array of numbers of shape {shape}, "
+                f"got {shown(found)}"
+            )
 
 
 def _common(values: list[Any]) -> Any:
