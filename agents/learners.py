@@ -143,11 +143,15 @@ def zoo_hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dic
     Raises
     ------
     UserError
-        For an unknown algorithm, or a file without a readable entry for the environment.
+        For an unknown algorithm, also in the task's own hyperparameters, or a file without a readable entry
+        for the environment.
     """
     known_name("algorithm", algo, LEARNERS)
     if file is None:
-        return lag_envs.hyperparams.hyperparameters(algo, make_task(env_id))
+        try:
+            return lag_envs.hyperparams.hyperparameters(algo, make_task(env_id))
+        except ValueError as error:
+            raise UserError(str(error)) from error
     import yaml
 
     try:

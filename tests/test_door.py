@@ -401,6 +401,12 @@ INVALID = {
 }
 
 
+def test_a_constant_beyond_floats_that_only_the_equation_has():
+    scene = changed(potential=lambda self, q, xp: 1e308 * q.x**2)()
+    with pytest.raises(FormulaError, match=r"constant beyond 1.8e308; write the energies in other units"):
+        scene.simulate([0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [[0.0] * len(scene.control_names)], dt=0.01)
+
+
 @mistake("kinetic", "kinetic(self, q, v, xp)", "method")
 def formula_that_is_no_method():
     return changed(kinetic=1.0)
@@ -409,6 +415,11 @@ def formula_that_is_no_method():
 @mistake("Bad.rests must be a method, rests(self), got {'x': 0.1}")
 def rests_that_are_no_method():
     return changed(rests={"x": 0.1})
+
+
+@mistake("Bad.potential must be a method, potential(self, q, xp), got a property")
+def formula_that_is_a_property():
+    return changed(potential=property(lambda self: 0.0))
 
 
 @mistake("Bad.window must be a method, window(self), got (0, 0, 1, 1)")

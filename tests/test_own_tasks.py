@@ -27,6 +27,7 @@ from lag_envs.envs.single import LagrangianEnv
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes import CartPole, Incline, Scene, StepRefused, parameter
+from lag_envs.stepping.compiling import BLOCK
 from lag_envs.tasks import Task, pivoted_bar
 from lag_envs.tasks.imperfections import KEYWORDS
 
@@ -195,6 +196,16 @@ def test_bad_targets(target):
             vec.reset(options={"target": given})
 
 
+def test_targets_and_angles_that_no_observation_can_show():
+    env = gym.make("OwnCrane-v0")
+    with pytest.raises(ValueError, match=r"target y_goal must lie within ±3.4e\+38, .* got 1e\+39"):
+        env.reset(options={"target": [0.0, 1e39]})
+    with pytest.raises(
+        ValueError, match=r"swing must lie within ±2.6e\+07 rad, got 3e\+07 rad; subtract whole"
+    ):
+        env.reset(options={"state": [0, 0, 1, 0, 3e7, 0]})
+
+
 def test_reward_scales_with_dt():
     rewards = []
     for dt in (0.05, 0.025):
@@ -324,6 +335,30 @@ def test_refusal_after_a_guard_that_is_no_number(kind, imperfections):
     with pytest.raises(StepRefused, match=message) as refusal:
         vec.step(np.zeros(vec.action_space.shape, np.float32))
     assert np.isfinite(refusal.value.results[1][[0, 2]]).all()
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_a_reward_of_nan_is_no_refusal(num_threads):
+    class Logarithmic(own_tasks.Deliver):
+        id = "OwnLogarithmic-v0"
+        terminated = Task.terminated
+
+        def reward(self, before, after, control, target, dt, xp):
+            return xp.log(after.x)
+
+    n = 2 * BLOCK
+    starts = np.tile([0.0, 0.0, 1.0, 0.0, 0.1, 0.0], (n, 1))
+    starts[:, 0] = np.where(np.arange(n) % 3, 1.0, -1.0)
+    refused = np.isin(np.arange(n), [1, n - 1])
+    starts[refused] = [1.0, 0.0, 0.2, -10.0, 0.0, 0.0]  # the rope runs out
+    vec = LagrangianVectorEnv(Logarithmic, n, num_threads=num_threads)
+    vec.reset(seed=0, options={"state": starts})
+    with pytest.raises(StepRefused, match=rf"environment 1 \(like those of {n - 1};") as error:
+        vec.step(np.zeros((n, 2), np.float32))
+    rewards = error.value.results[1]
+    assert np.array_equal(error.value.results[-1]["refused"], refused)
+    assert np.array_equal(np.isnan(rewards), (starts[:, 0] < 0.0) & ~refused)
+    assert (rewards[refused] == 0.0).all()
 
 
 @pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
@@ -562,7 +597,7 @@ def _guarded(function, x):
         ({"imperfections": {"lag": -1.0}}, "^Mistaken.imperfections: lag must be 0 or at least .* got -1 s"),
         ({"observe": lambda self, after, *_: np.ones(2)}, "numbers by name, .* got a ndarray"),
         ({"observe": lambda self, after, *_: {0: after.x}}, "observe: names must be texts, got 0"),
-        ({"target": {1: ("m", 0.1)}}, r"target\[1\]: a target's name must be a text"),
+        ({"target": {1: ("m", 0.1)}}, "Mistaken.target: 1 is not a name"),
         ({"kick": lambda self, after, draws, xp: {"x": "1"}}, "kick returns '1'; it must return numbers"),
         ({"kick": lambda self, after, draws, xp: {"x": math.inf}}, r"kick\['x'\] must be finite, got inf"),
         ({"reward": lambda self, *_: 1j}, "reward returns 1j; it must return a number"),
@@ -658,8 +693,16 @@ def test_a_state_is_not_taken_for_velocities():
     def force(self, before, after, control, target, dt, xp):
         return self.scene.applied(before, before, control, xp)["x"]
 
-    for name, reward in (("kinetic", energy), ("dissipation", loss), ("applied", force)):
-        message = rf"Mistaken.reward: self.scene.{name} is given the state .*; give after.v or before.v"
+    def swapped(self, before, after, control, target, dt, xp):
+        return self.scene.kinetic(after.v, after.q, xp)
+
+    for name, reward, what in (
+        ("kinetic", energy, "the state"),
+        ("dissipation", loss, "the state"),
+        ("applied", force, "the state"),
+        ("kinetic", swapped, "places"),
+    ):
+        message = rf"Mistaken.reward: self.scene.{name} is given {what} .*; give after.v or before.v"
         with pytest.raises(FormulaError, match=message):
             _mistaken(reward=reward)()
 
@@ -791,6 +834,10 @@ def test_misspelt_names_are_noticed():
         _mistaken(slew=3.0)()
     with pytest.warns(UserWarning, match="Mistaken.load_mass does not change .* {'load_mass'"):
         _mistaken(load_mass=3.0)()
+    with pytest.warns(UserWarning, match=r"nothing uses Mistaken.action_space; write action"):
+        _mistaken(action_space=gym.spaces.Box(-1.0, 1.0))()
+    with pytest.warns(UserWarning, match=r"nothing uses Mistaken.last_reward: without terminated, no step"):
+        _mistaken(terminated=Task.terminated, last_reward=lambda self, before, after, *_: -1.0)()
     with pytest.warns(UserWarning, match=r"nothing uses Sticky.disipation; did you mean dissipation?"):
         type("Sticky", (own_tasks.Crane,), {"disipation": lambda self, q, v, u, xp: v.x**2})()
     # A name that a formula uses is the user's own business.
@@ -984,7 +1031,13 @@ def test_order_of_a_task():
 
 @pytest.mark.parametrize(
     ("name", "meant"),
-    [("wind", ""), ("lod_mass", "did you mean load_mass"), ("num_envs", "gym.make_vec makes many; ")],
+    [
+        ("wind", ""),
+        ("lod_mass", "did you mean load_mass"),
+        ("num_envs", "gym.make_vec makes many; "),
+        ("steps", r"for another length of episodes, give duration \[s\]; "),
+        ("interval", "for another control interval, give dt; "),
+    ],
 )
 def test_unknown_keyword(name, meant):
     takes = "this environment takes gravity, load_mass, .*, target, .*, render_mode, diagnostics"

@@ -180,9 +180,13 @@ def test_a_task_changes_parts_of_the_policys_settings(monkeypatch):
     assert zoo_hyperparameters("td3", ENV)["policy_kwargs"] == usual | {"noise_steps": 4, "noise": 0.1}
 
 
-def test_learners_refuse_what_they_do_not_know(tmp_path):
+def test_learners_refuse_what_they_do_not_know(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="did you mean tqc"):
         zoo_hyperparameters("tqd", ENV)
+    with monkeypatch.context() as changed:
+        changed.setattr(TASKS[ENV], "hyperparameters", {"fast_poo": {"gamma": 0.9}})
+        with pytest.raises(UserError, match=r"there is no learner 'fast_poo', only .*, fast_ppo, "):
+            zoo_hyperparameters("ppo", ENV)
     for changes, message in (
         ({"gama": 0.9}, "ppo has no hyperparameter 'gama'; did you mean gamma"),
         ({"env_wrapper": [{"gymnasium.wrappers.ClipReward": {}}]}, "wrapper .*ClipReward is not known"),

@@ -168,7 +168,17 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
     task : Task
         The task. Discrete actions are not discretised again, nor explored by gSDE; our own learners take
         care of that themselves.
+
+    Raises
+    ------
+    ValueError
+        If the task states hyperparameters of a learner that does not exist.
     """
+    known = [*learners(), "off_policy"]
+    for name in task.hyperparameters:
+        if name not in known:
+            what = f"{type(task).__name__}.hyperparameters: there is no learner {name!r}"
+            raise ValueError(f"{what}, only {', '.join(known)}")
     families = ["off_policy"] * (learner in OFF_POLICY) + [learner]
     found = dict(DEFAULTS[learner])
     for family in families:

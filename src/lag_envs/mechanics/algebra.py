@@ -191,7 +191,12 @@ class Expr:
         if not self.terms:
             return 0.0
         if len(self.terms) == 1 and () in self.terms:
-            return float(self.terms[()])
+            try:
+                return float(self.terms[()])
+            except OverflowError:
+                raise FormulaError(
+                    "the equation of motion has a constant beyond 1.8e308; write the energies in other units"
+                ) from None
         return None
 
     def atoms(self) -> set[Atom]:

@@ -26,6 +26,7 @@ from lag_envs.scenes.checks import check_number, check_state, real_array, run_ch
 from lag_envs.scenes.declaring import ORDER, complete
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, structure_of
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
+from lag_envs.stepping.elementary import LARGEST_ANGLE
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks.definition import check_definition
 from lag_envs.tasks.formulas import UNBOUNDED, TaskFormulas, control_of
@@ -42,6 +43,11 @@ LONGEST_TURN = 5000.0
 OF_ENVIRONMENTS = ("render_mode", "diagnostics", "show_arrows", "show_trail", "show_readout")
 #: Further keywords that vector environments take.
 OF_BATCHES = ("num_envs", "max_episode_steps", "autoreset_mode", "num_threads", "show_tiles")
+#: What to do instead of giving these, which are no keywords of a single environment.
+INSTEAD = dict.fromkeys(OF_BATCHES, "gym.make_vec makes many;") | {
+    "interval": "for another control interval, give dt;",
+    "steps": "for another length of episodes, give duration [s];",
+}
 
 
 class TaskType(ABCMeta):
@@ -230,8 +236,7 @@ class Task(metaclass=TaskType):
         for name in sorted(set(parameters) - set(known)):
             target = ["target"] if type(self).target else []
             options = [*sorted(known), "dt", "duration", *target, *KEYWORDS, *OF_ENVIRONMENTS]
-            close = hint(name, [*options, *OF_BATCHES], " ").strip()
-            meant = "gym.make_vec makes many;" if name in OF_BATCHES else close
+            meant = INSTEAD.get(name) or hint(name, [*options, *OF_BATCHES], " ").strip()
             # The message has Python's own words, by which libraries notice that an environment takes no
             # `frameskip`.
             raise TypeError(
@@ -499,6 +504,11 @@ class Task(metaclass=TaskType):
                     f"{entry.name} must lie within ±{fastest:g} {entry.unit} at the start, got {value:g} "
                     f"{entry.unit}; a task whose `start` reaches further accepts more"
                 )
+            if entry.unit == "rad" and abs(value) > LARGEST_ANGLE and form_of(self.scene) is None:
+                raise ValueError(
+                    f"{entry.name} must lie within ±{LARGEST_ANGLE:g} rad, got {value:g} rad; subtract whole "
+                    "turns"
+                )
         named = Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True)))
         if (returned := self.check_start(named)) is not None:  # type: ignore[func-returns-value]
             raise FormulaError(
@@ -517,7 +527,7 @@ class Task(metaclass=TaskType):
                 raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
             target = [check_number(f"target {name}", target[name]) for name in names]
         elif len(names) == 1:
-            return check_number("target", target)
+            target = [check_number("target", target)]
         array = np.atleast_1d(real_array("target", target))
         if array.shape != (len(names),):
             raise ValueError(
@@ -527,6 +537,10 @@ class Task(metaclass=TaskType):
         for name, value in zip(names, array, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"target {name} must be finite, got {value}")
+            if abs(value) > UNBOUNDED:
+                raise ValueError(
+                    f"target {name} must lie within ±{UNBOUNDED:.3g}, the range of float32, got {value:g}"
+                )
         return float(array[0]) if len(names) == 1 else array
 
     def effort(self, control: Any) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import inspect
 import warnings
 import weakref
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 from lag_envs.errors import warn_of_misspelt
@@ -33,7 +34,13 @@ KINDS: dict[str, type] = dict.fromkeys(("id", "peer", "reference", "difficulty",
     "examples": Examples,
 }
 #: What a class has in place of keywords of environments.
-INSTEAD = {"max_episode_steps": "steps"} | {name: f"imperfections = {{{name!r}: ...}}" for name in KEYWORDS}
+INSTEAD = {
+    "max_episode_steps": "steps",
+    "observation_space": "observe and bounds",
+    "action_space": "action",
+    "reset": "start",
+    "render": "bodies and poses in the scene",
+} | {name: f"imperfections = {{{name!r}: ...}}" for name in KEYWORDS}
 
 _checked: weakref.WeakSet[type] = weakref.WeakSet()
 
@@ -64,6 +71,7 @@ def check_definition(kind: type, base: type) -> None:
                 what = f"{c.__name__}.{name} does not change the scene's {name}"
                 warnings.warn(f"{what}; write defaults = {{{name!r}: ...}}", UserWarning, stacklevel=2)
     _check_kick(kind, base)
+    _check_last_reward(kind, base)
     warn_of_misspelt(kind, base, INSTEAD)
     _checked.add(kind)
 
@@ -76,12 +84,13 @@ def _fault(base: type, name: str, value: Any) -> str:
     defined = name in METHODS or name in inspect.get_annotations(base) or name.startswith("_")
     if name in ("given", "fixed_target") or (hasattr(base, name) and not defined):
         return "hides an attribute of every task; choose another name"
+    is_property = isinstance(value, property | cached_property)
+    got = "got a property" if is_property else f"got {value!r:.60}"
     is_read = hasattr(value, "__get__")  # a method, or a property
+    if inspect.isfunction(vars(base).get(name)) and (is_property or not (is_read or callable(value))):
+        return f"must be {name}({', '.join(inspect.signature(getattr(base, name)).parameters)}), {got}"
     if is_read or (value is None and name in KINDS):
         return ""
-    got = f"got {value!r:.60}"
-    if inspect.isfunction(vars(base).get(name)) and not callable(value):
-        return f"must be {name}({', '.join(inspect.signature(getattr(base, name)).parameters)}), {got}"
     if name in MAPPINGS and not isinstance(value, Mapping):
         return f"must map names to values, as a dict does, {got}"
     if name == "controllers" and (odd := [n for n, c in value.items() if not isinstance(c, Controller)]):
@@ -108,3 +117,10 @@ def _check_kick(kind: Any, base: Any) -> None:
         )
     if kind.kick is base.kick and kind.draws:
         raise FormulaError(f"{kind.__name__}.draws is {kind.draws}, but there is no kick to use these draws")
+
+
+def _check_last_reward(kind: Any, base: Any) -> None:
+    """Warn if a class defines the last reward, but no step can get it."""
+    if "last_reward" in vars(kind) and kind.terminated is base.terminated:
+        what = f"nothing uses {kind.__name__}.last_reward: without terminated, no step ends an episode early"
+        warnings.warn(what, UserWarning, stacklevel=3)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.mechanics.algebra import INSTEAD, FormulaError
+from lag_envs.mechanics.layout import check_name
 from lag_envs.mechanics.recording import ARGUMENTS, Values, displaced, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
 from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of
@@ -66,6 +67,12 @@ class RecordedStep(NamedTuple):
     k: Any
     form: NormalForm | None
     chance: Callable[[float], Any]
+
+
+class Places(Values):
+    """The places of a state's coordinates."""
+
+    __slots__ = ()
 
 
 class State(Values):
@@ -293,8 +300,8 @@ class TaskFormulas:
             )
         return State(
             entries,
-            _in_order("coordinate", layout.names, places),
-            _in_order("velocity of a coordinate", layout.names, rates, why),
+            Places("coordinate", _in_order(layout.names, places), places),
+            Values("velocity of a coordinate", _in_order(layout.names, rates), rates, why),
         )
 
     def named_targets(self, g: Sequence) -> Values:
@@ -542,24 +549,25 @@ class TaskFormulas:
         return low, high
 
 
-def _in_order(what: str, names: Sequence[str], known: Mapping[str, Any], why: str = "") -> Values:
-    """Return numbers by coordinate, and by index up to the first coordinate that is missing."""
-    first = {name: known[name] for name in itertools.takewhile(known.__contains__, names)}
-    return Values(what, first, known, why=why)
+def _in_order(names: Sequence[str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers that can be accessed by index: those before the first that is missing."""
+    return {name: known[name] for name in itertools.takewhile(known.__contains__, names)}
 
 
 def _taking_states(scene: Any, name: str) -> Callable:
-    """Return a formula of the scene that takes a state as places, and refuses one as velocities.
+    """Return a formula of the scene that takes a state as places.
 
-    A state's entries have the names of places, but another order, and would be taken for velocities.
+    As velocities it refuses states and places: they have the same names, and would be taken for velocities.
     """
     method = getattr(scene, name)
 
     def taking(*given: Any, **named: Any) -> Any:
         bound = inspect.signature(method).bind(*given, **named)
-        if isinstance(bound.arguments.get("v"), State):
+        v = bound.arguments.get("v")
+        if isinstance(v, State | Places):
+            what = "the state" if isinstance(v, State) else "places"
             raise FormulaError(
-                f"self.scene.{name} is given the state in place of the velocities; give after.v or before.v"
+                f"self.scene.{name} is given {what} instead of the velocities; give after.v or before.v"
             )
         if isinstance(q := bound.arguments.get("q"), State):
             bound.arguments["q"] = q._places
@@ -648,8 +656,7 @@ def _target_boxes(task: Task) -> list[TargetBox]:
     of, found = type(task).__name__, []
     for name, given in _mapping(task, "target").items():
         where = f"{of}.target[{name!r}]"
-        if not isinstance(name, str) or name.startswith("_"):
-            raise FormulaError(f"{where}: a target's name must be a text that does not begin with _")
+        check_name(f"{of}.target", name)
         if not isinstance(given, tuple) or len(given) not in (2, 3) or not isinstance(given[0], str):
             raise FormulaError(f"{where} must be (unit, half width), got {given!r:.60}")
         *centre, half = _numbers_of(where, given[1:])
