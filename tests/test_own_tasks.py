@@ -367,7 +367,7 @@ def test_copies_go_on_alike(id, dump):
     env = gym.make(id).unwrapped
     env.reset(seed=2)
     env.action_space.seed(0)
-    twins = [dump.loads(dump.dumps(env)), copy.deepcopy(env)]
+    twins = [dump.loads(dump.dumps(env)), copy.deepcopy(env), copy.copy(env)]
     action = env.action_space.sample()
     expected = env.step(action)
     for twin in twins:

@@ -327,7 +327,9 @@ def test_observations_stay_in_the_space(env_id):
 
 @each_engine
 @pytest.mark.parametrize(
-    "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
+    "clone",
+    [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
+    ids=["copy", "deepcopy", "pickle"],
 )
 def test_copies_go_on_alike(env_id, clone):
     envs = gym.make_vec(env_id, num_envs=lanes(env_id), duration=1.0, **TASKS[env_id].examples.batch)

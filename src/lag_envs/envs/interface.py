@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import enum
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -44,6 +45,10 @@ class TaskEnv:
         if name[:1] != "_" and self._made and (name == "state" or not hasattr(type(self), name)):
             self.check_settable(name)
         object.__setattr__(self, name, value)
+
+    def __copy__(self) -> Self:
+        """Return an environment of its own: if two shared their memory, stepping one would step both."""
+        return copy.deepcopy(self)
 
     @property
     def spec(self) -> EnvSpec | None:
