@@ -33,6 +33,26 @@ def test_a_torn_last_line_is_passed_over_and_removed(board, torn):
     assert board.log.read_bytes().startswith(whole + b'{"at"')
 
 
+def test_the_first_submission_is_added_while_the_board_is_read(board, monkeypatch):
+    board.folder.mkdir(parents=True, exist_ok=True)
+    board.log.touch()
+
+    others = [add]
+
+    def read_log(path):
+        content = path.read_bytes()
+        if others:
+            others.pop()(board)
+        return content
+
+    monkeypatch.setattr("lag_envs.leaderboard.board.read_log", read_log)
+    assert not board.read().entries
+    assert list(states(board).values()) == ["pending"]
+    board.log.write_bytes(b"")
+    with pytest.raises(BoardError, match="is empty, though there are submissions; restore it"):
+        board.read()
+
+
 def test_a_last_line_without_its_end_counts(board):
     first = add(board)
     board.log.write_bytes(board.log.read_bytes()[:-1])

@@ -130,11 +130,16 @@ class Board:
             If there is no board, or its log is damaged.
         """
         self.require()
-        return self._state(read_log(self.log))
+        # In this order: a process that adds the first submission writes to the log before it copies files.
+        begun = self._has_submissions()
+        return self._state(read_log(self.log), begun)
 
-    def _state(self, content: bytes) -> BoardState:
-        """Return the state that follows from the log's content."""
-        if not content and any((self.folder / "submissions").glob("[!.]*")):
+    def _has_submissions(self) -> bool:
+        return any((self.folder / "submissions").glob("[!.]*"))
+
+    def _state(self, content: bytes, begun: bool) -> BoardState:
+        """Return the state that follows from the log's content; `begun` if there are submissions."""
+        if begun and not content:
             raise BoardError(f"{self.log} is empty, though there are submissions; {REMEDY}")
         return fold(parse(content)[0])
 
@@ -176,7 +181,7 @@ class Board:
             _remove(self.folder / "submissions" / ".new")
             for left in (self.folder / "results").glob("**/.*.part"):
                 _remove(left)
-            state = self._state(read_all(log))
+            state = self._state(read_all(log), self._has_submissions())
             last = state.last
 
             def append(event: str, **told: Any) -> None:
