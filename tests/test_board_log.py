@@ -36,7 +36,6 @@ def test_a_torn_last_line_is_passed_over_and_removed(board, torn):
 def test_the_first_submission_is_added_while_the_board_is_read(board, monkeypatch):
     board.folder.mkdir(parents=True, exist_ok=True)
     board.log.touch()
-
     others = [add]
 
     def read_log(path):
