@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import numbers
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,6 +43,16 @@ def shown(value: Any) -> str:
     """Return a value as text for an error message, shortened if it is long."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:150]}... ({len(text)} characters)"
+
+
+def not_a_method(name: str, value: Any, base: type) -> str:
+    """Return what is wrong with a class's attribute in place of a method of `base`, or an empty text."""
+    is_property = isinstance(value, property | cached_property)
+    if not is_property and (callable(value) or hasattr(value, "__get__")):
+        return ""
+    wanted = ", ".join(inspect.signature(getattr(base, name)).parameters)
+    got = "a property" if is_property else f"{value!r:.60}"
+    return f"must be a method, {name}({wanted}), got {got}"
 
 
 def run_check(of: Any) -> None:

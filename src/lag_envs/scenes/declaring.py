@@ -7,13 +7,13 @@ import dataclasses
 import inspect
 import sys
 from collections.abc import Mapping
-from functools import cached_property
 from types import MappingProxyType, ModuleType
 from typing import Any
 
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.layout import check_name, units
+from lag_envs.scenes.checks import not_a_method
 
 #: Class attributes that are mappings, and those that are names in order.
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
@@ -103,11 +103,8 @@ def declare_scene(cls: Any, meta: type[type]) -> None:
         delattr(cls, name)
     base: Any = next(c for c in cls.__mro__ if isinstance(c, meta) and c.__base__ is object)
     for name in [n for n in METHODS if n in own and n not in annotations]:
-        is_property = isinstance(own[name], property | cached_property)
-        if is_property or not (callable(own[name]) or hasattr(own[name], "__get__")):
-            wanted = ", ".join(inspect.signature(getattr(base, name)).parameters)
-            got = "a property" if is_property else f"{own[name]!r:.60}"
-            faults.append(f"{name} must be a method, {name}({wanted}), got {got}")
+        if fault := not_a_method(name, own[name], base):
+            faults.append(f"{name} {fault}")
     inherited = {name for parent in cls.__mro__[1:] for name in getattr(parent, "__dataclass_fields__", ())}
     for name in sorted(inherited.intersection(own) - {*annotations, "control"}):
         if not inspect.ismemberdescriptor(own[name]):  # a slot; of anything else a dataclass takes no notice

@@ -6,13 +6,13 @@ import inspect
 import warnings
 import weakref
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 from lag_envs.errors import warn_of_misspelt
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import SceneType
+from lag_envs.scenes.checks import not_a_method
 from lag_envs.tasks.formulas import FORMULAS
 from lag_envs.tasks.imperfections import KEYWORDS
 from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
@@ -84,13 +84,11 @@ def _fault(base: type, name: str, value: Any) -> str:
     defined = name in METHODS or name in inspect.get_annotations(base) or name.startswith("_")
     if name in ("given", "fixed_target") or (hasattr(base, name) and not defined):
         return "hides an attribute of every task; choose another name"
-    is_property = isinstance(value, property | cached_property)
-    got = "got a property" if is_property else f"got {value!r:.60}"
-    is_read = hasattr(value, "__get__")  # a method, or a property
-    if inspect.isfunction(vars(base).get(name)) and (is_property or not (is_read or callable(value))):
-        return f"must be {name}({', '.join(inspect.signature(getattr(base, name)).parameters)}), {got}"
-    if is_read or (value is None and name in KINDS):
+    if inspect.isfunction(vars(base).get(name)) and (fault := not_a_method(name, value, base)):
+        return fault
+    if hasattr(value, "__get__") or (value is None and name in KINDS):  # a method, or a property
         return ""
+    got = f"got {value!r:.60}"
     if name in MAPPINGS and not isinstance(value, Mapping):
         return f"must map names to values, as a dict does, {got}"
     if name == "controllers" and (odd := [n for n, c in value.items() if not isinstance(c, Controller)]):
