@@ -130,3 +130,8 @@ class Drift(Task):
 
 
 TASKS = (Deliver, Switched, Drift)
+
+
+def mistaken(**changes):
+    """Return `Deliver` with changes, most of them mistakes."""
+    return type("Mistaken", (Deliver,), changes)
