@@ -108,20 +108,27 @@ def _fill(image: Any, points: Any, ends: Any, frames: Any, poses: Any, colours: 
         whole = np.uint8(red), np.uint8(green), np.uint8(blue)
         for row in range(upper, lower):
             total, cover = 0.0, 0.0
-            for column in range(first, last):
+            column = first
+            while column < last:
                 change = room[row, column]
                 if change != 0.0:
                     room[row, column] = 0.0
                     total += change
                     cover = min(abs(total), 1.0)
                     cover = 0.0 if cover < EDGE else opaque if cover > 1.0 - EDGE else opaque * cover
+                # Coverage stays the same up to the next cell that an edge crosses.
+                start, column = column, column + 1
+                while column < last and room[row, column] == 0.0:
+                    column += 1
                 if cover == 1.0:
-                    image[row, column, 0], image[row, column, 1], image[row, column, 2] = whole
+                    for i in range(start, column):
+                        image[row, i, 0], image[row, i, 1], image[row, i, 2] = whole
                 elif cover > 0.0:
                     rest = 1.0 - cover
-                    image[row, column, 0] = np.uint8(rest * image[row, column, 0] + cover * red + 0.5)
-                    image[row, column, 1] = np.uint8(rest * image[row, column, 1] + cover * green + 0.5)
-                    image[row, column, 2] = np.uint8(rest * image[row, column, 2] + cover * blue + 0.5)
+                    for i in range(start, column):
+                        image[row, i, 0] = np.uint8(rest * image[row, i, 0] + cover * red + 0.5)
+                        image[row, i, 1] = np.uint8(rest * image[row, i, 1] + cover * green + 0.5)
+                        image[row, i, 2] = np.uint8(rest * image[row, i, 2] + cover * blue + 0.5)
             room[row, last] = 0.0
             room[row, last + 1] = 0.0
         begin = end
