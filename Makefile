@@ -42,6 +42,7 @@ test: setup  ## run the tests and doctests, all but the slow ones
 ALONE = tests/test_drive_speed.py
 
 test-slow: setup  ## install what the slow tests need (Pinocchio, Ray, the RL Zoo) and run them; it prints how long it took
+	@sh tools/browser
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,pinocchio,ray,zoo]'
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow --no-skips --durations 20 $(or $(ARGS),--ignore $(ALONE))
 	$(if $(ARGS),,$(BIN)/python -m pytest -m slow --no-skips $(ALONE))
