@@ -83,6 +83,7 @@ def frames(page, ghost=False, to_the_end=False):
         until(page, "document.querySelector('.go').textContent === 'Restart'")
         link_of(page)
     events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
+    page.close()  # it would go on beside the next drive
     # Numbers that change are painted on a canvas, not laid out as text; a restart lays out some.
     layouts = sum(e["name"] == "Layout" for e in events)
     called = [e for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e]
