@@ -46,7 +46,7 @@ def shown(value: Any) -> str:
 
 
 def not_a_method(name: str, value: Any, base: type) -> str:
-    """Return what is wrong with a class's attribute in place of a method of `base`, or an empty text."""
+    """Return what is wrong with an attribute that replaces a method of `base`; empty if nothing is."""
     is_property = isinstance(value, property | cached_property)
     if not is_property and (callable(value) or hasattr(value, "__get__")):
         return ""
