@@ -21,6 +21,7 @@ from plain_target import Plain, advance_in_python, evaluate_operations, in_pytho
 from reference import agreed_end
 
 import lag_envs
+from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, TwoLinkArm
 from lag_envs.scenes.base import Scene, parameter
@@ -34,7 +35,7 @@ from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.lag import LaggedStepper, lagged_stepper
 from lag_envs.stepping.machine import LaneLayout
 from lag_envs.stepping.series import REACH, Series
-from lag_envs.tasks import arm
+from lag_envs.tasks import TASKS, arm
 
 #: Error of a control step, relative to the entry or to 1.
 LARGEST_ERROR = 2e-13
@@ -558,9 +559,8 @@ def test_refused_step_leaves_the_environments_as_they_were(more, command):
 @pytest.mark.parametrize("env_id", [arm.Reach.id, "PivotedBar-v0"])
 @pytest.mark.parametrize("more", [{}, {"action_delay": 0.013}])
 def test_a_batch_has_an_order_and_snapshots(env_id, more):
-    envs = gym.make_vec(env_id, num_envs=3, lag=0.03, **more).unwrapped
+    envs = LagrangianVectorEnv(type("Other", (TASKS[env_id],), {"order": 12}), 3, lag=0.03, **more)
     envs.reset(seed=0)
-    envs.order = 12
     assert envs.order == 12
     actions = [envs.action_space.sample() for _ in range(6)]
     envs.step(actions[0])

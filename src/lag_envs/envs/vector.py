@@ -34,7 +34,6 @@ from lag_envs.envs.program import BLOCK
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import check_count, is_masked, real_array, shown
 from lag_envs.stepping.primitives import is_refused
-from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
@@ -452,20 +451,9 @@ class LagrangianVectorEnv(TaskEnv, VectorEnv[NDArray[np.float32], NDArray[np.flo
 
     @property
     def order(self) -> int | None:
-        """Order of the general series; None if the scene has a flow of its own, and then it cannot be set.
-
-        The order changes only the speed: each step is certified to the same tolerance with any order.
-        """
+        """Order of the general series, see `Task.order`; None if the scene has a flow of its own."""
         name = self._program.order_constant
         return None if name is None else int(self._pars[0][self._program.uniform.index(name)])
-
-    @order.setter
-    def order(self, value: int) -> None:
-        name = self._program.order_constant
-        if name is None:
-            raise ValueError(f"{type(self.task).__name__} has a flow of its own, so no order can be chosen")
-        for par in self._pars:
-            par[self._program.uniform.index(name)] = check_order("order", value)
 
     def _repr_html_(self) -> str:
         """Return the HTML of a notebook: the current pictures, spaces, controls, parameters."""

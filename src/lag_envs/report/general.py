@@ -31,7 +31,8 @@ from lag_envs.report.rivals import CompiledMethod, Rival
 from lag_envs.report.runner import ReportJob, Row, error_line
 from lag_envs.report.timing import Sample, interleaved
 from lag_envs.scenes.derivation import order_of
-from lag_envs.stepping.general import series_code_of
+from lag_envs.stepping.general import LARGEST_FIXED, series_code_of
+from lag_envs.stepping.series import LARGEST_ORDER
 
 __all__ = ["attempts_and_bounds", "content", "jobs", "shares", "timed_rivals", "worst_and_median"]
 
@@ -48,7 +49,7 @@ HEYOKA: Sequence[float] = (*TOLERANCES, 1e-15)
 CERTIFIED: Sequence[tuple[float, int]] = tuple(
     (tolerance, order)
     for tolerance in TOLERANCES
-    for order in (*range(3, CertifiedSeries.LOOPS), *range(CertifiedSeries.LOOPS, 25, 2))
+    for order in (*range(3, LARGEST_FIXED), *range(LARGEST_FIXED, LARGEST_ORDER + 1, 2))
     if -math.log10(tolerance) <= order <= 6.0 - 2.0 * math.log10(tolerance)
 )
 #: Settings of the other methods.

@@ -18,7 +18,7 @@ from lag_envs.report.motions import CertifiedSeries
 from lag_envs.report.points import LIBRARIES, MODES, TARGETS
 from lag_envs.report.runner import JobResult, Row
 from lag_envs.stepping.general import usual_order
-from lag_envs.stepping.series import TOLERANCE
+from lag_envs.stepping.series import LARGEST_ORDER, LEAST_ORDER, TOLERANCE
 
 #: Length of the control step [s], and the number of start states.
 DT, MEMBERS = 0.02, 200
@@ -117,11 +117,11 @@ def content(rows: Sequence[Row], problems: Sequence[JobResult]) -> Content:
             "compilation does not. Samples are taken in turn, and times are medians of processor time. The "
             "errors are those of the timed calls, at the fastest setting that reaches the given "
             "error.",
-            "lag_envs certifies each step, at a tolerance and an order; below order 8 its code is compiled "
-            "for that order alone, with loops written out. Environments always step at a tolerance of "
-            f"{TOLERANCE:g}, by code for any order. The others give no bound: which setting reaches an "
-            "error is known here only from the exact ends. heyoka runs with fast_math, without compact mode "
-            "(loops written out), its compiled step in a compiled loop, in a batch in blocks of two widths. "
+            "lag_envs certifies each step, at a tolerance and an order, by the code of a task that chooses "
+            f"this order; tasks may choose {LEAST_ORDER} to {LARGEST_ORDER}. Environments always step at a "
+            f"tolerance of {TOLERANCE:g}. The others give no bound: which setting reaches an error is known "
+            "here only from the exact ends. heyoka runs with fast_math, without compact mode (loops written "
+            "out), its compiled step in a compiled loop, in a batch in blocks of two widths. "
             "MuJoCo runs its own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its "
             "articulated-body algorithm in RK4 steps in a C++ loop. For both, a moving support is modelled "
             "by an inertial force in its own frame. RK4, DOP853 and Radau IIA take fixed steps and are "

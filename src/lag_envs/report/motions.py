@@ -156,26 +156,24 @@ class CertifiedSeries(Rival):
     """The general engine at an order and a tolerance, each step certified.
 
     The setting is the tolerance. Single states run in the loop of `Scene.simulate`, batches in the block
-    function of the vector environments; both take one control step from each state. Below the order `LOOPS`
-    they call code for that order alone, which no environment does.
+    function of the vector environments; both take one control step from each state.
     """
 
     family = "lag_envs"
-    LOOPS = 8
 
     def __init__(self, order: int, tolerance: float) -> None:
         super().__init__(f"lag_envs, order {order}", tolerance)
-        self.order, self._fixed_order = order, order if order < self.LOOPS else None
+        self.order = order
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile."""
         assert isinstance(problems, SceneProblems) and steps == 1
         scene = problems.scene
-        code, numbers = series_code_of(scene)
+        code, numbers = series_code_of(scene, self.order)
         starts, controls, count = problems.starts, problems.controls, len(problems)
         width, order = starts.shape[1], float(self.order)
         if not together:
-            alone = _alone(code, self.setting, self._fixed_order)
+            alone = _alone(code, self.setting)
             ends = np.empty_like(starts)
 
             def run() -> None:
@@ -183,7 +181,7 @@ class CertifiedSeries(Rival):
                     raise ArithmeticError("a step was refused")
 
             return Sample(run, count, ends=ends.copy)
-        batch = _batch(code, self.setting, self._fixed_order)
+        batch = _batch(code, self.setting)
         begin = blocks(np.concatenate([starts, controls], axis=1).T, BLOCK)
         memory = np.zeros((len(begin), begin.shape[1] + len(code.rows) + 1, BLOCK))
 
@@ -198,7 +196,7 @@ class CertifiedSeries(Rival):
 
 
 @cache
-def _alone(code: Any, tolerance: float, fixed_order: int | None) -> Callable:
+def _alone(code: Any, tolerance: float) -> Callable:
     """Compile ``alone(starts, controls, ends, dt, order, constants...)``: a control step from each state."""
     lines = [
         f"rows = np.zeros({code.scratch})",
@@ -212,11 +210,11 @@ def _alone(code: Any, tolerance: float, fixed_order: int | None) -> Callable:
         "return refused",
     ]
     arguments = ", ".join(["starts, controls, ends, dt, order", *code.constants])
-    return compile_lines("alone", arguments, lines, code.compile(tolerance, fixed_order))
+    return compile_lines("alone", arguments, lines, code.compile(tolerance))
 
 
 @cache
-def _batch(code: Any, tolerance: float, fixed_order: int | None) -> Callable:
+def _batch(code: Any, tolerance: float) -> Callable:
     """Compile ``batch(memory, count, dt, order, constants...)``: a control step of all lanes, block by block.
 
     A block has rows for state and controls, then those of `SeriesCode.rows`, and one more.
@@ -252,4 +250,4 @@ def _batch(code: Any, tolerance: float, fixed_order: int | None) -> Callable:
         "return refused",
     ]
     arguments = ", ".join(["memory, count, dt, order", *code.constants])
-    return compile_lines("batch", arguments, lines, code.compile_block(tolerance, fixed_order))
+    return compile_lines("batch", arguments, lines, code.compile_block(tolerance))

@@ -139,4 +139,4 @@ def code_of(scene: Scene, dt: float, lagged: bool = False) -> Any:
         from lag_envs.stepping.flow_code import flow_code
 
         return flow_code(form, dt, absent)
-    return _form_or_series(scene, lagged).code(absent)
+    return _form_or_series(scene, lagged).code(absent, order=chosen_order_of(scene))

@@ -27,6 +27,9 @@ from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.rows import Rows
 from lag_envs.stepping.series import TOLERANCE
 
+#: The largest order for which code for this order alone may be faster.
+LARGEST_FIXED = 12
+
 
 class SeriesStepper:
     """One scene's control step by the general series, as lines of code and compiled functions.
@@ -43,7 +46,7 @@ class SeriesStepper:
         self._lowering, self._parts = self._lowered()
         self._whole = self._lowering.without(*self._parts)
         converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
-        self._codes: dict[tuple[frozenset[str], bool], SeriesCode] = {}
+        self._codes: dict[tuple[frozenset[str], bool, int | None], SeriesCode] = {}
         self._tangents: dict[tuple[str, ...], tuple[Lowering, tuple[list[int], dict]]] = {}
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
 
@@ -201,14 +204,17 @@ class SeriesStepper:
 
     # --- code -----------------------------------------------------------------------------------------------
 
-    def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesCode:
+    def code(self, absent: frozenset[str] = frozenset(), fused: bool = True, order: int = 0) -> SeriesCode:
         """Return the step without the terms of constants that are zero.
 
-        An unfused step has the same bits as plain + - * / √ and comparisons on any machine.
+        An unfused step has the same bits as plain + - * / √ and comparisons on any machine. If it will be
+        called with one order only, that order may be given: the bits are the same, but low orders are faster.
         """
-        if (absent, fused) not in self._codes:
-            self._codes[absent, fused] = SeriesCode(self, self.record(absent, fused), absent, fused)
-        return self._codes[absent, fused]
+        fixed = order if order and _pays_fixed(order, len(self._layout.free)) else None
+        key = absent, fused, fixed
+        if key not in self._codes:
+            self._codes[key] = SeriesCode(self, self.record(absent, fused), *key)
+        return self._codes[key]
 
     def record(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesRecord:
         """Return the record of the step, without the terms of constants that are zero."""
@@ -267,10 +273,15 @@ class SeriesCode:
     """
 
     def __init__(
-        self, stepper: SeriesStepper, record: SeriesRecord, absent: frozenset[str], fused: bool = True
+        self,
+        stepper: SeriesStepper,
+        record: SeriesRecord,
+        absent: frozenset[str],
+        fused: bool = True,
+        fixed_order: int | None = None,
     ) -> None:
         layout = stepper._layout
-        self.record, self._fused = record, fused
+        self.record, self._options = record, {"fused": fused, "fixed_order": fixed_order}
         self.start = [f"y{i}" for i in range(len(layout.state))]
         self.end = [f"z{i}" for i in range(len(layout.state))]
         self.controls = stepper.arguments
@@ -328,16 +339,15 @@ class SeriesCode:
         """The arguments of `advance`."""
         return ", ".join(["rows", *self.start, *self.controls, "dt", "order", *self.constants])
 
-    def compile(self, tolerance: float = TOLERANCE, fixed_order: int | None = None) -> Callable:
+    def compile(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., applied..., status)``.
 
         The status is the number of attempts, or negative if the step is refused. The sums of the substeps'
         bounds on places and velocities are left at the end of `rows`, which has `scratch` numbers.
-        `compile_attempt` says what `fixed_order` is.
         """
         results = ", ".join([*self.end, *self.applied, "status"])
         body = [*self.any_step, f"return {results}"]
-        return compile_lines("advance", self.arguments, body, self.engine(tolerance, fixed_order))
+        return compile_lines("advance", self.arguments, body, self.engine(tolerance))
 
     @property
     def any_step(self) -> list[str]:
@@ -353,11 +363,11 @@ class SeriesCode:
             *self.finish,
         ]
 
-    def engine(self, tolerance: float = TOLERANCE, fixed_order: int | None = None) -> Callable:
+    def engine(self, tolerance: float = TOLERANCE) -> Callable:
         """Return the function that the lines of `any_step` call."""
         from lag_envs.stepping.driver import compile_advance
 
-        return compile_advance(self.record, tolerance, self._fused, fixed_order)
+        return compile_advance(self.record, tolerance, **self._options)
 
     def bounded(
         self,
@@ -382,11 +392,11 @@ class SeriesCode:
         """The function that `compile_simulate` makes."""
         return self.compile_simulate()
 
-    def compile_block(self, tolerance: float = TOLERANCE, fixed_order: int | None = None) -> Callable:
+    def compile_block(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``advance_block(memory, base, count, order)`` on `rows` of BLOCK lanes."""
         from lag_envs.stepping.driver import compile_advance_block
 
-        return compile_advance_block(self.record, tolerance, self._fused, fixed_order=fixed_order)
+        return compile_advance_block(self.record, tolerance, **self._options)
 
     def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, order, constants...)``.
@@ -429,12 +439,20 @@ def stepper_of(mechanics: Mechanics, kind: type[SeriesStepper] = SeriesStepper) 
     return _steppers[kind, mechanics.key]
 
 
-def series_code_of(scene: Any) -> tuple[SeriesCode, list[float]]:
-    """Return the code with which the general series steps a scene, and the constants that it takes."""
+def series_code_of(scene: Any, order: int = 0) -> tuple[SeriesCode, list[float]]:
+    """Return the code with which the general series steps a scene, and the constants that it takes.
+
+    `SeriesStepper.code` says what `order` is.
+    """
     stepper = stepper_of(scene.mechanics)
     constants = stepper.constants(parameter_values(scene))
-    code = stepper.code(absent_from(constants))
+    code = stepper.code(absent_from(constants), order=order)
     return code, [constants[name.removeprefix("k_")] for name in code.constants]
+
+
+def _pays_fixed(order: int, coordinates: int) -> bool:
+    """Return whether code for one order is faster than loops over orders; long code is not."""
+    return order < 8 or (order <= LARGEST_FIXED and coordinates <= 2)
 
 
 def usual_order(dt: float) -> int:

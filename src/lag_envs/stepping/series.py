@@ -37,8 +37,8 @@ from lag_envs.stepping.matrices import Inverse, matrix_times
 from lag_envs.stepping.slots import ExpansionStart, Factor, SeriesSlots
 from lag_envs.stepping.target import Target
 
-#: The largest order of a series.
-LARGEST_ORDER = 24
+#: The largest order of a series, and the least one that a task may choose; lower ones would not pay.
+LARGEST_ORDER, LEAST_ORDER = 24, 6
 
 #: Largest truncation error of a substep, relative to the size of the velocities.
 TOLERANCE = 1e-14
@@ -51,9 +51,10 @@ TRIES = 4
 
 
 def check_order(name: str, value: Any) -> int:
-    """Return an order that a task may choose, or raise a ValueError; orders below 6 would not pay."""
-    if type(value) is not int or not 6 <= value <= LARGEST_ORDER:
-        raise ValueError(f"{name} must be a whole number from 6 to {LARGEST_ORDER}, got {value!r:.60}")
+    """Return an order that a task may choose, or raise a ValueError."""
+    if type(value) is not int or not LEAST_ORDER <= value <= LARGEST_ORDER:
+        span = f"{LEAST_ORDER} to {LARGEST_ORDER}"
+        raise ValueError(f"{name} must be a whole number from {span}, got {value!r:.60}")
     return value
 
 

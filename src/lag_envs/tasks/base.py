@@ -24,7 +24,7 @@ from lag_envs.scenes import picture
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import check_number, check_state, real_array, run_check, shown
 from lag_envs.scenes.declaring import ORDER, complete
-from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, structure_of
+from lag_envs.scenes.derivation import chosen_order_of, form_of, layout_of, motion_constants_of, structure_of
 from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
 from lag_envs.stepping.elementary import LARGEST_ANGLE
 from lag_envs.stepping.series import check_order
@@ -484,7 +484,7 @@ class Task(metaclass=TaskType):
     def variant(self) -> tuple:
         """What determines the code besides the class; the environments of a batch must agree in this."""
         scene, form = self.scene, form_of(self.scene)
-        order = form.order(self.dt) if form else 0
+        order = form.order(self.dt) if form else chosen_order_of(scene)
         return *structure_of(scene)[1:3], scene.mechanics.zeros, order, self.fixed_target is None
 
     @property

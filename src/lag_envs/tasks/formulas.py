@@ -22,7 +22,13 @@ from lag_envs.mechanics.algebra import INSTEAD, FormulaError
 from lag_envs.mechanics.layout import check_name
 from lag_envs.mechanics.recording import ARGUMENTS, Values, displaced, formula, parameter_names, twin
 from lag_envs.scenes.checks import StepRefused, check_number
-from lag_envs.scenes.derivation import form_of, layout_of, motion_constants_of, step_argument_of
+from lag_envs.scenes.derivation import (
+    chosen_order_of,
+    form_of,
+    layout_of,
+    motion_constants_of,
+    step_argument_of,
+)
 from lag_envs.scenes.door import is_own
 from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
@@ -245,7 +251,8 @@ class TaskFormulas:
         """Return the code of a control step."""
         if self._form:
             return flow_code(self._form, self._task.dt, absent)
-        return stepper_of(self._task.scene.mechanics).code(absent)
+        scene = self._task.scene
+        return stepper_of(scene.mechanics).code(absent, order=chosen_order_of(scene))
 
     # --- formulas -------------------------------------------------------------------------------------------
 

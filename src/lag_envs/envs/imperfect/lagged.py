@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lag_envs.scenes.derivation import chosen_order_of
 from lag_envs.stepping.compiling import absent_from
 from lag_envs.stepping.lag import lagged_stepper
 
@@ -36,7 +37,7 @@ class LaggedCode:
         constants: Mapping[str, Any],
     ) -> None:
         lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
-        code = lagged_stepper(scene.mechanics).code(absent_from(lagged))
+        code = lagged_stepper(scene.mechanics).code(absent_from(lagged), order=chosen_order_of(scene))
         n = range(len(code.controls) // 3)
         self.start, self.end = start, end
         self.in_force = [f"reached{i}" for i in n]
