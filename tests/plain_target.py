@@ -162,7 +162,7 @@ def in_python(name, source, *helpers, inner=False, **constants):
     return scope[name]
 
 
-def advance_in_python(record, tolerance=TOLERANCE, fused=False, fixed_order=None):
+def advance_in_python(record, tolerance=TOLERANCE, fused=False, fixed_order=None, bounds=False):
     """Replace `compile_advance`: the driver's own code on `Plain`."""
     series, layout, n = Series(record), LaneLayout(record), record.size
 
@@ -171,10 +171,11 @@ def advance_in_python(record, tolerance=TOLERANCE, fused=False, fixed_order=None
         q, v = (list(rows[first : first + n]) for first in (layout.q, layout.v))
         lane = StepProgress(q, v, *rows[layout.status : layout.span])
         dt = rows[layout.span]
-        after, bounds = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
+        after, left_out = series.substep(Plain(series.slots), given, lane, dt, order, tolerance)
         rows[layout.q : layout.span] = [*after.q, *after.v, after.attempts, after.left, after.wish]
-        for row, bound in enumerate(bounds, layout.bounds):
-            rows[row] += bound
+        if bounds:
+            for row, bound in enumerate(left_out, layout.bounds):
+                rows[row] += bound
         return not after.left > 0.0
 
     names = driver._numbers(record, tolerance) | {"attempt": attempt, "np": np}

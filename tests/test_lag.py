@@ -169,7 +169,7 @@ class Case(NamedTuple):
     def step(self, lags, dt, order=None, tolerance=None):
         """Return the same from the engine, and the number of attempts."""
         code, numbers = code_of(self.scene)
-        advance = code.compile(*([tolerance] if tolerance else []))
+        advance = code.compile(*([tolerance] if tolerance else []), bounds=True)
         given = [*self.state, *self.applied, *self.command, *(1.0 / lag for lag in lags)]
         rows = np.zeros(code.scratch)
         *found, status = advance(rows, *given, dt, float(order or general.usual_order(dt)), *numbers)

@@ -102,7 +102,7 @@ def _run(rows, order, tolerance):
 
 @cache
 def compiled(record, lanes=1, fused=True):
-    return compile_python("run", _run, compile_attempt(record, lanes, fused))
+    return compile_python("run", _run, compile_attempt(record, lanes, fused, bounds=lanes == 1))
 
 
 def attempts(system, cases, order, tolerance):
@@ -728,7 +728,7 @@ def attempt_for(target, machine_code, fused, lanes):
     module.triple = target
     double, whole = ir.DoubleType(), ir.IntType(64)
     kind = ir.FunctionType(whole, [double.as_pointer(), whole, double])
-    machine._write(module, "attempt", kind, record, lanes, fused)
+    machine._write(module, "attempt", kind, record, lanes, fused, bounds=lanes == 1)
     parsed = binding.parse_assembly(str(module))
     return parsed, machine_code.emit_assembly(parsed)
 

@@ -47,8 +47,6 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = rows[span] = dt
-    for i in range(2 * n):
-        rows[bounds + i] = 0.0
     while attempt(rows, 0, order, tolerance) == 0:
         if rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt:
             return -np.int64(rows[status])
@@ -131,10 +129,14 @@ def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, Any]:
 
 @cache
 def compile_advance(
-    record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True, fixed_order: int | None = None
+    record: SeriesRecord,
+    tolerance: float = TOLERANCE,
+    fused: bool = True,
+    fixed_order: int | None = None,
+    bounds: bool = False,
 ) -> Callable:
     """Compile ``advance(rows, dt, order)``, see `_advance`; `compile_attempt` says what the rest is."""
-    attempt = compile_attempt(record, 1, fused, fixed_order)
+    attempt = compile_attempt(record, 1, fused, fixed_order, bounds)
     return compile_python("advance_lane", _advance, attempt, **_numbers(record, tolerance))
 
 

@@ -339,15 +339,15 @@ class SeriesCode:
         """The arguments of `advance`."""
         return ", ".join(["rows", *self.start, *self.controls, "dt", "order", *self.constants])
 
-    def compile(self, tolerance: float = TOLERANCE) -> Callable:
+    def compile(self, tolerance: float = TOLERANCE, bounds: bool = False) -> Callable:
         """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., applied..., status)``.
 
-        The status is the number of attempts, or negative if the step is refused. The sums of the substeps'
-        bounds on places and velocities are left at the end of `rows`, which has `scratch` numbers.
+        The status is the number of attempts, or negative if the step is refused. `rows` has `scratch`
+        numbers. With `bounds`, the substeps' bounds on places and velocities are added to the last of them.
         """
         results = ", ".join([*self.end, *self.applied, "status"])
         body = [*self.any_step, f"return {results}"]
-        return compile_lines("advance", self.arguments, body, self.engine(tolerance))
+        return compile_lines("advance", self.arguments, body, self.engine(tolerance, bounds))
 
     @property
     def any_step(self) -> list[str]:
@@ -363,11 +363,11 @@ class SeriesCode:
             *self.finish,
         ]
 
-    def engine(self, tolerance: float = TOLERANCE) -> Callable:
+    def engine(self, tolerance: float = TOLERANCE, bounds: bool = False) -> Callable:
         """Return the function that the lines of `any_step` call."""
         from lag_envs.stepping.driver import compile_advance
 
-        return compile_advance(self.record, tolerance, **self._options)
+        return compile_advance(self.record, tolerance, bounds=bounds, **self._options)
 
     def bounded(
         self,
@@ -379,13 +379,13 @@ class SeriesCode:
     ) -> tuple[int, tuple[Any, Any]]:
         """Take a step; return its status, and the sums of bounds on places and velocities."""
         rows = np.zeros(self.scratch)
-        *_, status = self._advance(rows, *state, *controls, dt, float(order), *constants)
+        *_, status = self._bounded(rows, *state, *controls, dt, float(order), *constants)
         n = self._n
         return status, (rows[-2 * n : -n], rows[-n:])
 
     @cached_property
-    def _advance(self) -> Callable:
-        return self.compile()
+    def _bounded(self) -> Callable:
+        return self.compile(bounds=True)
 
     @cached_property
     def simulation(self) -> Callable:

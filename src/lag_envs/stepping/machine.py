@@ -53,7 +53,7 @@ class LaneLayout:
         What is left of the control step (0 when it is done), the length wished for the next substep, and the
         length of the control step [s].
     bounds : int
-        Sums of the bounds on what places and velocities leave out; a single lane has them.
+        Sums of the bounds on what places and velocities leave out; only a single lane may have them.
     rows : int
         Number of rows.
     """
@@ -342,7 +342,11 @@ def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
 
 @cache
 def compile_attempt(
-    record: SeriesRecord, lanes: int, fused: bool = True, fixed_order: int | None = None
+    record: SeriesRecord,
+    lanes: int,
+    fused: bool = True,
+    fixed_order: int | None = None,
+    bounds: bool = False,
 ) -> Callable:
     """Return ``attempt(rows, at, order, tolerance)``, to be called from compiled code.
 
@@ -362,15 +366,17 @@ def compile_attempt(
     fixed_order : int, optional
         The only order for which the function is called. All loops over orders are then written out. The bits
         are the same. It pays for low orders: the code grows with the square of the order.
+    bounds : bool, default False
+        Whether the attempt's bounds are added to the rows `bounds` of its only lane.
     """
     digest = hashlib.sha256(
-        f"{_version()} {record.digest} {lanes} {fused} {fixed_order}".encode()
+        f"{_version()} {record.digest} {lanes} {fused} {fixed_order} {bounds}".encode()
     ).hexdigest()[:16]
     kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _INT, _DOUBLE])
     return _linked(
         f"attempt_{digest}",
         kind,
-        lambda module, name: _write(module, name, kind, record, lanes, fused, fixed_order),
+        lambda module, name: _write(module, name, kind, record, lanes, fused, fixed_order, bounds),
     )
 
 
@@ -382,6 +388,7 @@ def _write(
     lanes: int,
     fused: bool,
     fixed_order: int | None = None,
+    bounds: bool = False,
 ) -> ir.Function:
     """Write the function ``name(rows, order, tolerance)`` into a module."""
     step, layout, n = Series(record), LaneLayout(record), record.size
@@ -409,15 +416,15 @@ def _write(
     inputs = {name: read(row) for name, row in layout.inputs.items()}
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
     before = StepProgress(q, v, read(layout.status), read(layout.left), read(layout.wish))
-    lane, bounds = step.substep(t, inputs, before, read(layout.span), order, t.broadcast(tolerance))
+    lane, left_out = step.substep(t, inputs, before, read(layout.span), order, t.broadcast(tolerance))
     for i in range(n):
         write(layout.q + i, lane.q[i])
         write(layout.v + i, lane.v[i])
     write(layout.status, lane.attempts)
     write(layout.left, lane.left)
     write(layout.wish, lane.wish)
-    if lanes == 1:
-        for row, bound in enumerate(bounds, layout.bounds):
+    if bounds:
+        for row, bound in enumerate(left_out, layout.bounds):
             write(row, t.add(read(row), bound))
     over = t.all(t.negated(t.less(t.number(0.0), lane.left)))
     builder.ret(builder.zext(over, _INT))
