@@ -40,12 +40,12 @@ def other_processor(report: dict[str, Any]) -> str:
         f"reach {min(ratios.values()):.2g} to {max(ratios.values()):.2g} times CartPole's speed "
         f"(`docs/speed-other.json`, {report['date']})."
     )
-    if not below:
-        return found
-    return found + (
-        f" {len(below)} of them are below the target of {target.ratio:g}, at {below[0]:.0f} to "
-        f"{below[-1]:.0f} % of the peak."
-    )
+    if below:
+        found += (
+            f" {len(below)} of them are below the target of {target.ratio:g}, at {below[0]:.0f} to "
+            f"{below[-1]:.0f} % of the peak."
+        )
+    return " ".join([found, *_told(report, "Of scenes defined by energies alone: ")])
 
 
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
@@ -100,10 +100,7 @@ def speed_markdown(report: dict[str, Any]) -> str:
         f"{report['date']}).",
         markdown_table(["id", *sizes], lines),
     ]
-    if told := list(filter(None, (_of_series(report["rows"], target) for target in SERIES_TARGETS))):
-        parts.append(
-            f"Scenes defined by energies alone, compared with the same `CartPole-v1`: {'; '.join(told)}."
-        )
+    parts += _told(report, "Scenes defined by energies alone, compared with the same `CartPole-v1`: ")
     if costs := _with_series(report):
         head, *body = cost_table(costs)
         parts += [
@@ -129,6 +126,12 @@ def _with_series(report: dict[str, Any]) -> Costs | None:
     """Return the costs of chains, if their series were counted."""
     costs: Costs | None = report.get("chains")
     return costs if costs and "series" in costs else None
+
+
+def _told(report: dict[str, Any], start: str) -> list[str]:
+    """Return a sentence on the general series; none if it was not measured."""
+    told = list(filter(None, (_of_series(report["rows"], target) for target in SERIES_TARGETS)))
+    return [f"{start}{'; '.join(told)}."] if told else []
 
 
 def _of_series(rows: list[dict[str, Any]], target: SpeedTarget) -> str:
