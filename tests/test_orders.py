@@ -9,6 +9,8 @@ from lag_envs import orders
 from lag_envs.cli import main
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
+from lag_envs.scenes import Chain
+from lag_envs.stepping.general import stepper_of
 from lag_envs.tasks import TASKS, incline
 from lag_envs.tasks.cart_pole import CartPoleExact
 
@@ -29,6 +31,14 @@ def test_any_order_takes_the_same_steps():
     assert not np.array_equal(seen[8], seen[24])
     for order in (8, 10):
         np.testing.assert_allclose(seen[order], seen[24], rtol=0.0, atol=1e-13)
+
+
+def test_low_orders_have_code_of_their_own():
+    """The fewer coordinates, the higher the order up to which it is faster."""
+    for bars, largest in ((2, 12), (3, 7)):
+        stepper = stepper_of(Chain(bars=bars).mechanics)
+        assert stepper.code(order=largest) is not stepper.code()
+        assert stepper.code(order=largest + 1) is stepper.code()
 
 
 @pytest.mark.parametrize("order", [5, 25, 10.0, True, "10"])
