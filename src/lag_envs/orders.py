@@ -11,10 +11,11 @@ from lag_envs.benchmark.environments import stepped
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
 from lag_envs.scenes.derivation import order_of
-from lag_envs.stepping.series import LARGEST_ORDER
+from lag_envs.stepping.general import LARGEST_FIXED
+from lag_envs.stepping.series import LARGEST_ORDER, LEAST_ORDER
 
-#: Only even orders: in the general series an odd order takes as much work as the next even order.
-ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
+#: Odd ones only where code may be for one order: in loops they take as much work as the next even order.
+ORDERS = (*range(LEAST_ORDER, LARGEST_FIXED), *range(LARGEST_FIXED, LARGEST_ORDER + 1, 2))
 #: A lower order is preferred to an order that is faster by less than this factor, which is within the noise.
 SAME = 1.02
 #: Number of steps in a sample.
@@ -73,7 +74,7 @@ def lines(task: type[Any], times: dict[int, float], now: int) -> Sequence[str]:
     """Return the lines of the table, and the advice for the task."""
     found = best_order(times)
     rows = [f"{order:5}  {taken:8.1f}  {taken / times[found]:5.2f}" for order, taken in times.items()]
-    if times[now + now % 2] <= SAME * times[found]:
+    if times[now if now in times else now + 1] <= SAME * times[found]:
         advice = f"{task.__name__} is stepped by order {now}, which is as fast as any."
     else:
         advice = (
