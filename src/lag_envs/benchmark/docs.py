@@ -45,7 +45,7 @@ def other_processor(report: dict[str, Any]) -> str:
             f" {len(below)} of them are below the target of {target.ratio:g}, at {below[0]:.0f} to "
             f"{below[-1]:.0f} % of the peak."
         )
-    return " ".join([found, *_told(report, "Of scenes defined by energies alone: ")])
+    return " ".join([found, *_told(report, "Scenes defined by energies alone: ")])
 
 
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
